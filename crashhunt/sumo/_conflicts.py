@@ -27,40 +27,24 @@ class Conflict(NamedTuple):
     """A path across a junction that conflicts with the vehicle's path.
 
     The conflict area is where the two centre lines are closer than 80 % of the mean width of the lanes.
-
-    Args:
-        must_yield: whether the rules of the junction make the vehicle yield to the path.
-        begin_m: distance on the vehicle's path from the stop line to the conflict area, in m.
-        end_m: distance on the vehicle's path from the stop line to the end of the conflict area, in m.
-        other_begin_m: distance on the other path from its stop line to the conflict area, in m.
-        other_end_m: distance on the other path to the end of the conflict area, in m.
-        source: the lane before the other path; empty for a crossing.
-        link: the other path; None for a crossing, which persons use in both directions.
     """
 
-    must_yield: bool
-    begin_m: float
-    end_m: float
-    other_begin_m: float
-    other_end_m: float
-    source: str
-    link: LaneLink | None
+    must_yield: bool  # whether the rules of the junction make the vehicle yield to the path
+    begin_m: float  # distance on the vehicle's path from the stop line to the conflict area, in m
+    end_m: float  # distance on the vehicle's path from the stop line to the end of the conflict area, in m
+    other_begin_m: float  # distance on the other path from its stop line to the conflict area, in m
+    other_end_m: float  # distance on the other path to the end of the conflict area, in m
+    source: str  # the lane before the other path; empty for a crossing
+    link: LaneLink | None  # the other path; None for a crossing, which persons use in both directions
 
 
 class Approach(NamedTuple):
-    """A lane on which an actor can be that takes a conflicting path.
-
-    Args:
-        conflict: the conflict.
-        offset_m: distance from the stop line of the path to the start of the lane, in m; negative before the line.
-        edges: the edges that must follow each other in the actor's route.
-        back: how many places the edge of the lane is behind the first of these edges; -1 inside the junction.
-    """
+    """A lane on which an actor can be that takes a conflicting path."""
 
     conflict: Conflict
-    offset_m: float
-    edges: tuple[str, str]
-    back: int
+    offset_m: float  # distance from the stop line of the path to the start of the lane, in m; negative before the line
+    edges: tuple[str, str]  # the edges that must follow each other in the actor's route
+    back: int  # how many places the edge of the lane is behind the first of these edges; -1 inside the junction
 
 
 class Conflicts:

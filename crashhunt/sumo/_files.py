@@ -52,21 +52,13 @@ _ATTRIBUTE = re.compile(rb"\s+([^\s=]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
 @dataclass(frozen=True, slots=True)
 class FileReference:
-    """An attribute of an XML file that names another file.
+    """An attribute of an XML file that names another file."""
 
-    Args:
-        tag: XML tag of the element that names the file.
-        attribute: name of the XML attribute that contains the file name.
-        value: the file name, as written in the XML file.
-        kind: whether SUMO reads or writes the file.
-        offset: offset of the element in the XML file, in bytes.
-    """
-
-    tag: str
-    attribute: str
-    value: str
-    kind: Literal["read", "written"]
-    offset: int
+    tag: str  # XML tag of the element that names the file
+    attribute: str  # name of the XML attribute that contains the file name
+    value: str  # the file name, as written in the XML file
+    kind: Literal["read", "written"]  # whether SUMO reads or writes the file
+    offset: int  # offset of the element in the XML file, in bytes
 
     def __str__(self) -> str:
         """Return the reference as it is written in the XML file."""

@@ -54,27 +54,16 @@ _ON_FOOT = frozenset(("pedestrian", "wheelchair"))
 
 
 class Piece(NamedTuple):
-    """A straight piece of the centre line of a lane.
+    """A straight piece of the centre line of a lane."""
 
-    Args:
-        lane: id of the lane.
-        x: start of the piece, in m.
-        y: start of the piece, in m.
-        cos: direction of the piece.
-        sin: direction of the piece.
-        length: length of the piece, in m.
-        start: position of its start on the lane, in SUMO's metres of the lane.
-        scale: SUMO's metres of the lane in a metre of the piece.
-    """
-
-    lane: str
-    x: float
-    y: float
-    cos: float
-    sin: float
-    length: float
-    start: float
-    scale: float
+    lane: str  # id of the lane
+    x: float  # start of the piece, in m
+    y: float  # start of the piece, in m
+    cos: float  # direction of the piece
+    sin: float  # direction of the piece
+    length: float  # length of the piece, in m
+    start: float  # position of its start on the lane, in SUMO's metres of the lane
+    scale: float  # SUMO's metres of the lane in a metre of the piece
 
 
 class _Part(NamedTuple):

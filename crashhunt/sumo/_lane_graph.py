@@ -42,45 +42,28 @@ VEHICLE_CLASSES = frozenset(
 
 
 class LaneLink(NamedTuple):
-    """A path from one road's lane to another road's lane.
+    """A path from one road's lane to another road's lane."""
 
-    Args:
-        target: the lane that it leads to.
-        inside: the lanes inside the junction, in driving order.
-        length_m: total length of the lanes inside the junction, in m.
-        signal: id of the traffic light; empty if there is none.
-        signal_index: index of the link in the state of the traffic light.
-        direction: direction as in SUMO: ``s`` straight, ``l`` left and so on.
-        state: state as in SUMO: ``M`` major, ``m`` minor, ``=`` equal, ``s`` stop, ``w`` allway stop.
-    """
-
-    target: str
-    inside: tuple[str, ...]
-    length_m: float
-    signal: str
-    signal_index: int
-    direction: str
-    state: str
+    target: str  # the lane that it leads to
+    inside: tuple[str, ...]  # the lanes inside the junction, in driving order
+    length_m: float  # total length of the lanes inside the junction, in m
+    signal: str  # id of the traffic light; empty if there is none
+    signal_index: int  # index of the link in the state of the traffic light
+    direction: str  # direction as in SUMO: ``s`` straight, ``l`` left and so on
+    state: str  # state as in SUMO: ``M`` major, ``m`` minor, ``=`` equal, ``s`` stop, ``w`` allway stop
 
 
 @dataclass(slots=True, eq=False)
 class GraphLane:
-    """A lane of the graph.
+    """A lane of the graph."""
 
-    Args:
-        id: id of the lane.
-        edge: id of its edge.
-        index: index on its edge.
-        data: the contents of the network file.
-        links: links from the lane; of a lane inside a junction, the rest of its link.
-        entries: the lanes of roads, and the links from them, that lead to the lane or through it.
-    """
-
-    id: str
-    edge: str
-    index: int
-    data: NetworkLane
+    id: str  # id of the lane
+    edge: str  # id of its edge
+    index: int  # index on its edge
+    data: NetworkLane  # the contents of the network file
+    # links from the lane; of a lane inside a junction, the rest of its link
     links: list[LaneLink] = field(default_factory=list)
+    # the lanes of roads, and the links from them, that lead to the lane or through it
     entries: list[tuple[str, LaneLink]] = field(default_factory=list)
     lines: LaneLines | None = None
     line_m: float | None = None
@@ -355,35 +338,21 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
 
 
 class Signal(NamedTuple):
-    """A traffic light on a route.
+    """A traffic light on a route."""
 
-    Args:
-        distance_m: distance from the start of the lane for which it was looked up, in m.
-        id: id of the traffic light.
-        link: index of the link in its state.
-    """
-
-    distance_m: float
-    id: str
-    link: int
+    distance_m: float  # distance from the start of the lane for which it was looked up, in m
+    id: str  # id of the traffic light
+    link: int  # index of the link in its state
 
 
 class RouteStep(NamedTuple):
-    """What follows from a lane of a road on a route.
+    """What follows from a lane of a road on a route."""
 
-    Args:
-        link: the link to the next road of the route; None if the lane does not lead there, or at the end.
-        reach: index of the last road of the route that can be reached without a lane change.
-        changes: number of lane changes that are necessary on this road.
-        run_m: distance from the start of the lane to where it leaves the route or the route ends, in m.
-        rest_m: distance from the start of the lane to the end of the route, in m, with lane changes.
-    """
-
-    link: LaneLink | None
-    reach: int
-    changes: int
-    run_m: float
-    rest_m: float
+    link: LaneLink | None  # the link to the next road of the route; None if the lane does not lead there, or at the end
+    reach: int  # index of the last road of the route that can be reached without a lane change
+    changes: int  # number of lane changes that are necessary on this road
+    run_m: float  # distance from the start of the lane to where it leaves the route or the route ends, in m
+    rest_m: float  # distance from the start of the lane to the end of the route, in m, with lane changes
 
 
 class RouteGuide:

@@ -28,35 +28,21 @@ _NONE = -1
 
 
 class LanePath(NamedTuple):
-    """Points along consecutive lanes.
+    """Points along consecutive lanes."""
 
-    Args:
-        rows: 1, x, y, heading, width, speed limit and index of the lane of each point, shape (N, 7).
-        places: x and y of each point, shape (2, N).
-        begin: the first row on the last metres before the lane for which the path was made.
-        first: the row at the start of this lane.
-        last: the last row on this lane.
-    """
-
-    rows: Array
-    places: Array
-    begin: int
-    first: int
-    last: int
+    rows: Array  # 1, x, y, heading, width, speed limit and index of the lane of each point, shape (N, 7)
+    places: Array  # x and y of each point, shape (2, N)
+    begin: int  # the first row on the last metres before the lane for which the path was made
+    first: int  # the row at the start of this lane
+    last: int  # the last row on this lane
 
 
 class Sampling(NamedTuple):
-    """How points along lanes are sampled.
+    """How points along lanes are sampled."""
 
-    Args:
-        spacing_m: distance of two points, in m.
-        points: number of points.
-        before: number of points behind the vehicle.
-    """
-
-    spacing_m: float
-    points: int
-    before: int
+    spacing_m: float  # distance of two points, in m
+    points: int  # number of points
+    before: int  # number of points behind the vehicle
 
     @property
     def stride(self) -> int:

@@ -33,42 +33,26 @@ NO_VALUE = -1073741824.0
 
 @dataclass(frozen=True, slots=True)
 class ReaderSetup:
-    """What a reader is created with, for one agent and one episode.
+    """What a reader is created with, for one agent and one episode."""
 
-    Args:
-        agent: Identifier of the agent, which is also the identifier of its vehicle.
-        request: The part with the values of its settings.
-        graph: The lanes of the network. One object is shared by all readers of the simulator, in all episodes.
-        conflicts: The conflicts at the junctions, shared like the lanes.
-        places: Finds the vehicle on the network. One object is shared by all readers of the agent.
-        step_length_s: Length of a step, in s.
-        start_m: The vehicle's odometer (`vehicle.getDistance`) at the start of the episode, in m.
-        start_s: Simulation time at the start of the episode, in s.
-        steering: Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the
-            vehicle's actions contain no steering angle. The angle then follows from the yaw rate.
-        core: The compiled core; None if it is not used.
-        reference_share: How far the reference point is ahead of the centre, as a share of a vehicle's length.
-        near: The lanes near each square, by sampling and vehicle class, shared like the lanes.
-        moving: Identifiers of the vehicles that move freely.
-        seed: Seed of the trial.
-        obstacles: The obstacles of the episode; None if there are none.
-    """
-
-    agent: str
-    request: RequestedPart
-    graph: LaneGraph
-    conflicts: Conflicts
-    places: Places
-    step_length_s: float
-    start_m: float
-    start_s: float
+    agent: str  # identifier of the agent, which is also the identifier of its vehicle
+    request: RequestedPart  # the part with the values of its settings
+    graph: LaneGraph  # The lanes of the network. One object is shared by all readers of the simulator, in all episodes.
+    conflicts: Conflicts  # the conflicts at the junctions, shared like the lanes
+    places: Places  # Finds the vehicle on the network. One object is shared by all readers of the agent.
+    step_length_s: float  # length of a step, in s
+    start_m: float  # the vehicle's odometer (`vehicle.getDistance`) at the start of the episode, in m
+    start_s: float  # simulation time at the start of the episode, in s
+    # Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the vehicle's
+    # actions contain no steering angle. The angle then follows from the yaw rate.
     steering: Callable[[], float] | None = None
-    core: Core | None = None
-    reference_share: float = 0.0
+    core: Core | None = None  # the compiled core; None if it is not used
+    reference_share: float = 0.0  # how far the reference point is ahead of the centre, as a share of a vehicle's length
+    # the lanes near each square, by sampling and vehicle class, shared like the lanes
     near: NearLanesOf = field(default_factory=dict)
-    moving: frozenset[str] = frozenset()
-    seed: int = 0
-    obstacles: ObstacleOutlines | None = None
+    moving: frozenset[str] = frozenset()  # identifiers of the vehicles that move freely
+    seed: int = 0  # seed of the trial
+    obstacles: ObstacleOutlines | None = None  # the obstacles of the episode; None if there are none
 
     @property
     def settings(self) -> Mapping[str, float]:
@@ -96,39 +80,23 @@ class ReaderSetup:
 
 @dataclass(slots=True)
 class Moment:
-    """The state after a step, as seen by one agent. All readers of the agent receive the same object in a step.
-
-    Args:
-        scene: The scene.
-        row: The row of the agent's vehicle in the scene.
-        lane: The vehicle's lane, such as ``E0_1``; the last lane if the vehicle is off every lane.
-        hidden: Identifiers of the actors that the agent does not see, as in scenes.
-    """
+    """The state after a step, as seen by one agent. All readers of the agent receive the same object in a step."""
 
     scene: Scene
-    row: int
-    lane: str
-    hidden: frozenset[str]
+    row: int  # the row of the agent's vehicle in the scene
+    lane: str  # the vehicle's lane, such as ``E0_1``; the last lane if the vehicle is off every lane
+    hidden: frozenset[str]  # identifiers of the actors that the agent does not see, as in scenes
 
 
 class Place(NamedTuple):
-    """Where a vehicle is on the network.
+    """Where a vehicle is on the network."""
 
-    Args:
-        lane: its lane, or its last lane if it is off every lane.
-        position_m: distance of the front bumper from the start of the lane, in m, as SUMO measures it.
-        guide: its route.
-        number: index of the lane's edge on the route; of the edge before, inside a junction; -1 off the route.
-        x: x of the centre of the vehicle, in m.
-        y: y of the centre of the vehicle, in m.
-    """
-
-    lane: GraphLane
-    position_m: float
-    guide: RouteGuide
-    number: int
-    x: float
-    y: float
+    lane: GraphLane  # its lane, or its last lane if it is off every lane
+    position_m: float  # distance of the front bumper from the start of the lane, in m, as SUMO measures it
+    guide: RouteGuide  # its route
+    number: int  # index of the lane's edge on the route; of the edge before, inside a junction; -1 off the route
+    x: float  # x of the centre of the vehicle, in m
+    y: float  # y of the centre of the vehicle, in m
 
 
 class Places:

@@ -179,29 +179,17 @@ def _along_route(guide: RouteGuide, number: int, lane: GraphLane) -> Iterator[Gr
 
 
 class _Block(NamedTuple):
-    """The candidates of the lanes around a square, with the own lane, the left and the right lane first.
+    """The candidates of the lanes around a square, with the own lane, the left and the right lane first."""
 
-    Args:
-        rows: points of all lanes, with an empty row before and behind each lane.
-        low: the empty row before each lane, shape (lanes, 1).
-        high: the empty row behind each lane, shape (lanes, 1).
-        begin: first row of the window of each lane, in which the nearest point is.
-        x: x of the points in the windows, from the middle of the square, shape (lanes, points).
-        y: y of the points in the windows, from the middle of the square.
-        squared: squared distance of these points from the middle of the square.
-        middle_x: x of the middle of the square.
-        middle_y: y of the middle of the square.
-    """
-
-    rows: Array
-    low: NDArray[np.intp]
-    high: NDArray[np.intp]
-    begin: NDArray[np.intp]
-    x: Array
-    y: Array
-    squared: Array
-    middle_x: float
-    middle_y: float
+    rows: Array  # points of all lanes, with an empty row before and behind each lane
+    low: NDArray[np.intp]  # the empty row before each lane, shape (lanes, 1)
+    high: NDArray[np.intp]  # the empty row behind each lane, shape (lanes, 1)
+    begin: NDArray[np.intp]  # first row of the window of each lane, in which the nearest point is
+    x: Array  # x of the points in the windows, from the middle of the square, shape (lanes, points)
+    y: Array  # y of the points in the windows, from the middle of the square
+    squared: Array  # squared distance of these points from the middle of the square
+    middle_x: float  # x of the middle of the square
+    middle_y: float  # y of the middle of the square
 
 
 _EMPTY = np.zeros((1, 6))

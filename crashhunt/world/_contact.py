@@ -45,37 +45,21 @@ _KINK, _NO_TURN = 0.02, 0.01  # tolerance as a share of the distance, reached at
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """The first contact of two actors.
+    """The first contact of two actors."""
 
-    Args:
-        time_s: simulation time of the contact, in s.
-        share: time of the contact as a share of the step, from 0 to 1; 1 is the present scene.
-        drives_into: whether the first actor drives into the second; otherwise the second drives into the first.
-        x: x of the first actor's front bumper, in m.
-        y: y of the first actor's front bumper, in m.
-        speed: speed of the first actor, in m/s.
-        other_speed: speed of the second actor, in m/s.
-        face: the side of the first actor that is touched.
-        other_face: the side of the second actor that is touched.
-        turn: heading of the second actor minus heading of the first actor, in rad, from -pi to pi.
-        jumps: whether the first actor causes the contact by an instantaneous lane change.
-        other_jumps: whether the second actor causes the contact by an instantaneous lane change.
-        gap_m: a lower bound of the distance between their outlines; 0 if they touch.
-    """
-
-    time_s: float
-    share: float
-    drives_into: bool
-    x: float
-    y: float
-    speed: float
-    other_speed: float
-    face: Face
-    other_face: Face
-    turn: float
-    jumps: bool = False
-    other_jumps: bool = False
-    gap_m: float = 0.0
+    time_s: float  # simulation time of the contact, in s
+    share: float  # time of the contact as a share of the step, from 0 to 1; 1 is the present scene
+    drives_into: bool  # whether the first actor drives into the second; otherwise the second drives into the first
+    x: float  # x of the first actor's front bumper, in m
+    y: float  # y of the first actor's front bumper, in m
+    speed: float  # speed of the first actor, in m/s
+    other_speed: float  # speed of the second actor, in m/s
+    face: Face  # the side of the first actor that is touched
+    other_face: Face  # the side of the second actor that is touched
+    turn: float  # heading of the second actor minus heading of the first actor, in rad, from -pi to pi
+    jumps: bool = False  # whether the first actor causes the contact by an instantaneous lane change
+    other_jumps: bool = False  # whether the second actor causes the contact by an instantaneous lane change
+    gap_m: float = 0.0  # a lower bound of the distance between their outlines; 0 if they touch
 
     @property
     def is_sideways(self) -> bool:
@@ -85,21 +69,13 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class _Party:
-    """An actor at the time of the contact.
+    """An actor at the time of the contact."""
 
-    Args:
-        rectangle: the part of the actor that is touched.
-        leads: whether this is the front part of the actor.
-        trails: whether this is the back part of the actor.
-        velocity: velocity of this part, without a jump sideways, in m/s.
-        jump: sideways jump of the actor at the contact, in m.
-    """
-
-    rectangle: Rectangle
-    leads: bool
-    trails: bool
-    velocity: tuple[float, float]
-    jump: tuple[float, float] = (0.0, 0.0)
+    rectangle: Rectangle  # the part of the actor that is touched
+    leads: bool  # whether this is the front part of the actor
+    trails: bool  # whether this is the back part of the actor
+    velocity: tuple[float, float]  # velocity of this part, without a jump sideways, in m/s
+    jump: tuple[float, float] = (0.0, 0.0)  # sideways jump of the actor at the contact, in m
 
     @property
     def stands(self) -> bool:

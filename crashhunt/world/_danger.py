@@ -63,19 +63,12 @@ _WINDOW, _TAIL = 4096, 128  # scenes: long episodes are summed per window; the t
 
 
 class DangerousMoment(NamedTuple):
-    """The most critical moment of an episode.
+    """The most critical moment of an episode."""
 
-    Args:
-        danger: criticality, from 0 to 1.
-        step: number of the step.
-        agent: identifier of the controlled vehicle.
-        other: identifier of the other actor; empty if no actor was near.
-    """
-
-    danger: float
-    step: int
-    agent: str
-    other: str
+    danger: float  # criticality, from 0 to 1
+    step: int  # number of the step
+    agent: str  # identifier of the controlled vehicle
+    other: str  # identifier of the other actor; empty if no actor was near
 
 
 class DangerMeter:

@@ -80,23 +80,14 @@ def event_counts(counts: Mapping[str, int]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A path across a junction, from an incoming lane to an outgoing lane.
+    """A path across a junction, from an incoming lane to an outgoing lane."""
 
-    Args:
-        junction: name of the junction.
-        source: the incoming lane.
-        target: the outgoing lane.
-        inside: the lanes inside the junction.
-        signalised: whether a traffic light controls the path.
-        shape: the centre line inside the junction, as (x, y) pairs in m.
-    """
-
-    junction: str
-    source: str
-    target: str
-    inside: tuple[str, ...]
-    signalised: bool
-    shape: tuple[tuple[float, float], ...]
+    junction: str  # name of the junction
+    source: str  # the incoming lane
+    target: str  # the outgoing lane
+    inside: tuple[str, ...]  # the lanes inside the junction
+    signalised: bool  # whether a traffic light controls the path
+    shape: tuple[tuple[float, float], ...]  # the centre line inside the junction, as (x, y) pairs in m
 
     def distance(self, x: float, y: float) -> float:
         """Return the distance of a point from the path, in m."""

@@ -40,17 +40,11 @@ def actor_of_manoeuvre(name: str) -> Actor:
 
 @dataclass(slots=True)
 class _Mover:
-    """A vehicle that moves in steps.
+    """A vehicle that moves in steps."""
 
-    Args:
-        x: position of the front along the road, in m.
-        y: position across the road, in m.
-        speed: speed along the road, in m/s.
-    """
-
-    x: float
-    y: float
-    speed: float
+    x: float  # position of the front along the road, in m
+    y: float  # position across the road, in m
+    speed: float  # speed along the road, in m/s
 
     def state(self) -> ActorState:
         return ActorState(self.x, self.y, 0.0, self.speed)

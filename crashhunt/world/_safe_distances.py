@@ -93,96 +93,57 @@ def time_to_drive(distance_m: float, speed_mps: float, acceleration_mps2: float,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Neighbor:
-    """An actor or a stop line ahead of or behind the agent, on one lane.
+    """An actor or a stop line ahead of or behind the agent, on one lane."""
 
-    Args:
-        actor: identifier of the actor; empty for a red light.
-        gap_m: gap between the bumpers, in m; negative if the vehicles are side by side.
-        speed_mps: speed of the actor along the lane, in m/s.
-        braking_mps2: greatest deceleration of the actor, in m/s²; the usual one of its type.
-        acceleration_mps2: greatest acceleration of the actor, in m/s².
-        kind: type of the obstacle: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing path, before
-            which the agent must stop).
-    """
-
-    actor: str
-    gap_m: float
-    speed_mps: float
-    braking_mps2: float
-    acceleration_mps2: float = 0.0
+    actor: str  # identifier of the actor; empty for a red light
+    gap_m: float  # gap between the bumpers, in m; negative if the vehicles are side by side
+    speed_mps: float  # speed of the actor along the lane, in m/s
+    braking_mps2: float  # greatest deceleration of the actor, in m/s²; the usual one of its type
+    acceleration_mps2: float = 0.0  # greatest acceleration of the actor, in m/s²
+    # type of the obstacle: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing path, before which the
+    # agent must stop)
     kind: NeighborKind = "vehicle"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crossing:
-    """An actor whose path crosses or joins the agent's path in a junction.
+    """An actor whose path crosses or joins the agent's path in a junction."""
 
-    Args:
-        actor: identifier of the actor.
-        distance_m: distance of the agent to the conflict area, in m; negative inside and after the area.
-        exit_m: distance that the agent drives until its rear has left the conflict area, in m.
-        actor_distance_m: distance of the actor to the conflict area, in m.
-        actor_exit_m: distance that the actor drives until its rear has left the conflict area, in m.
-        speed_mps: speed of the actor, in m/s.
-        braking_mps2: greatest deceleration of the actor, in m/s².
-        has_right_of_way: whether the agent must yield to the actor.
-    """
-
-    actor: str
-    distance_m: float
-    exit_m: float
-    actor_distance_m: float
-    actor_exit_m: float
-    speed_mps: float
-    braking_mps2: float
-    has_right_of_way: bool
+    actor: str  # identifier of the actor
+    distance_m: float  # distance of the agent to the conflict area, in m; negative inside and after the area
+    exit_m: float  # distance that the agent drives until its rear has left the conflict area, in m
+    actor_distance_m: float  # distance of the actor to the conflict area, in m
+    actor_exit_m: float  # distance that the actor drives until its rear has left the conflict area, in m
+    speed_mps: float  # speed of the actor, in m/s
+    braking_mps2: float  # greatest deceleration of the actor, in m/s²
+    has_right_of_way: bool  # whether the agent must yield to the actor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Side:
-    """The neighbouring lane of an agent on one side.
+    """The neighbouring lane of an agent on one side."""
 
-    Args:
-        exists: whether the lane exists and the agent may use it.
-        ahead: the nearest vehicle ahead of the agent in this lane; None if there is none.
-        behind: the nearest vehicle behind the agent in this lane; None if there is none.
-    """
-
-    exists: bool
-    ahead: Neighbor | None = None
-    behind: Neighbor | None = None
+    exists: bool  # whether the lane exists and the agent may use it
+    ahead: Neighbor | None = None  # the nearest vehicle ahead of the agent in this lane; None if there is none
+    behind: Neighbor | None = None  # the nearest vehicle behind the agent in this lane; None if there is none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """What an action of acceleration and steering does to a vehicle.
+    """What an action of acceleration and steering does to a vehicle."""
 
-    Args:
-        speed_mps: speed after the step, in m/s.
-        lane_change: the side to which the vehicle leaves its lane; 1 left, -1 right, 0 neither.
-    """
-
-    speed_mps: float
-    lane_change: int
+    speed_mps: float  # speed after the step, in m/s
+    lane_change: int  # the side to which the vehicle leaves its lane; 1 left, -1 right, 0 neither
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surroundings:
-    """What a careful driver of the agent's vehicle would consider in one step.
+    """What a careful driver of the agent's vehicle would consider in one step."""
 
-    Args:
-        speed_mps: speed of the agent, in m/s.
-        acceleration_mps2: greatest acceleration of the agent, in m/s².
-        braking_mps2: deceleration of the agent at full braking, in m/s².
-        ahead: vehicles and red lights on the agent's path.
-        crossing: actors whose paths cross the agent's path.
-        sides: the neighbouring lanes by direction, 1 for left and -1 for right; a missing side is unknown, as inside a
-            junction.
-    """
-
-    speed_mps: float
-    acceleration_mps2: float
-    braking_mps2: float
-    ahead: tuple[Neighbor, ...] = ()
-    crossing: tuple[Crossing, ...] = ()
+    speed_mps: float  # speed of the agent, in m/s
+    acceleration_mps2: float  # greatest acceleration of the agent, in m/s²
+    braking_mps2: float  # deceleration of the agent at full braking, in m/s²
+    ahead: tuple[Neighbor, ...] = ()  # vehicles and red lights on the agent's path
+    crossing: tuple[Crossing, ...] = ()  # actors whose paths cross the agent's path
+    # the neighbouring lanes by direction, 1 for left and -1 for right; a missing side is unknown, as inside a junction
     sides: Mapping[int, Side] = field(default_factory=dict)

@@ -43,39 +43,23 @@ def _between_steps(step_length_s: float) -> int:
 
 
 class Track(NamedTuple):
-    """The path of an agent as arrays, each of shape (samples,).
+    """The path of an agent as arrays, each of shape (samples,)."""
 
-    Args:
-        time: time in s since the first scene.
-        x: x of the centre of the outline, in m.
-        y: y of the centre of the outline, in m.
-        heading: heading in rad, without jumps by whole turns.
-        z: z of the front bumper, in m.
-        half_length: half the length of the agent, in m.
-        half_width: half the width of the agent, in m.
-        height: height of the agent, in m.
-    """
-
-    time: Array
-    x: Array
-    y: Array
-    heading: Array
-    z: Array
-    half_length: Array
-    half_width: Array
-    height: Array
+    time: Array  # time in s since the first scene
+    x: Array  # x of the centre of the outline, in m
+    y: Array  # y of the centre of the outline, in m
+    heading: Array  # heading in rad, without jumps by whole turns
+    z: Array  # z of the front bumper, in m
+    half_length: Array  # half the length of the agent, in m
+    half_width: Array  # half the width of the agent, in m
+    height: Array  # height of the agent, in m
 
 
 class Others(NamedTuple):
-    """The actors near an agent as arrays, each of shape (pairs,); all further fields are as in `Track`.
+    """The actors near an agent as arrays, each of shape (pairs,); all further fields are as in `Track`."""
 
-    Args:
-        sample: index of the sample in the track.
-        who: number of the actor, as assigned by `tracks`.
-    """
-
-    sample: NDArray[np.intp]
-    who: NDArray[np.intp]
+    sample: NDArray[np.intp]  # index of the sample in the track
+    who: NDArray[np.intp]  # number of the actor, as assigned by `tracks`
     x: Array
     y: Array
     heading: Array
@@ -101,17 +85,11 @@ def sampled(frames: Sequence[Frame], step_length_s: float) -> Iterator[tuple[Fra
 
 
 class Reach(NamedTuple):
-    """The part of an agent's path in which other actors matter; actors that do not touch this part are irrelevant.
+    """The part of an agent's path in which other actors matter; actors that do not touch this part are irrelevant."""
 
-    Args:
-        ahead: length of the relevant part ahead along the path, in m; 0 if all actors matter.
-        behind: length of the relevant part backwards along the path, in m.
-        unknown: length by which the path is continued straight at its end, in m.
-    """
-
-    ahead: float = 0.0
-    behind: float = 0.0
-    unknown: float = 0.0
+    ahead: float = 0.0  # length of the relevant part ahead along the path, in m; 0 if all actors matter
+    behind: float = 0.0  # length of the relevant part backwards along the path, in m
+    unknown: float = 0.0  # length by which the path is continued straight at its end, in m
 
 
 def ways(
@@ -157,19 +135,13 @@ def tracks(parts: Sequence[tuple[Frame, Array]], agent: str, within_m: float) ->
 
 
 class _Fronts(NamedTuple):
-    """The data of tracks, with front bumpers instead of centres.
+    """The data of tracks, with front bumpers instead of centres."""
 
-    Args:
-        time: time in s, shape (samples,).
-        own: shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent.
-        theirs: sample, actor number, and the same seven values of each near actor, each of shape (pairs,).
-        names: names of the numbered actors.
-    """
-
-    time: Array
-    own: Array
+    time: Array  # time in s, shape (samples,)
+    own: Array  # shape (7, samples): x, y, heading, z, half the length and the width, and height of the agent
+    # sample, actor number, and the same seven values of each near actor, each of shape (pairs,)
     theirs: Sequence[NDArray[Any]]
-    names: list[str]
+    names: list[str]  # names of the numbered actors
 
 
 def _fronts_from_core(
@@ -342,42 +314,26 @@ _MOST_BYTES = 1 << 28  # of unpacked data: more is damage or an attack, not a re
 
 
 class ActorState(NamedTuple):
-    """The state of an actor after a step.
+    """The state of an actor after a step."""
 
-    Args:
-        x: x of the centre of the front bumper, in m.
-        y: y of the centre of the front bumper, in m.
-        heading: heading in rad, counter-clockwise from the x axis.
-        speed: speed in m/s.
-        z: z of the front bumper, in m; 0 if the map is flat.
-        grade: rise of the road per metre.
-    """
-
-    x: float
-    y: float
-    heading: float
-    speed: float
-    z: float = 0.0
-    grade: float = 0.0
+    x: float  # x of the centre of the front bumper, in m
+    y: float  # y of the centre of the front bumper, in m
+    heading: float  # heading in rad, counter-clockwise from the x axis
+    speed: float  # speed in m/s
+    z: float = 0.0  # z of the front bumper, in m; 0 if the map is flat
+    grade: float = 0.0  # rise of the road per metre
 
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """The path of an actor while it was visible; an actor that returns has several paths.
+    """The path of an actor while it was visible; an actor that returns has several paths."""
 
-    Args:
-        actor: id, kind and size of the actor.
-        first: the step after which the actor was first visible; 0 is before the first step.
-        states: states after this step and after each following step.
-        lanes: lanes of the actor as (step, lane), after the steps for which they were recorded.
-        spines: the centre lines of a long vehicle in bends, as (step, centre line).
-    """
-
-    actor: Actor
-    first: int
-    states: tuple[ActorState, ...]
+    actor: Actor  # id, kind and size of the actor
+    first: int  # the step after which the actor was first visible; 0 is before the first step
+    states: tuple[ActorState, ...]  # states after this step and after each following step
+    # lanes of the actor as (step, lane), after the steps for which they were recorded
     lanes: tuple[tuple[int, str], ...] = ()
-    spines: tuple[tuple[int, Spine], ...] = ()
+    spines: tuple[tuple[int, Spine], ...] = ()  # the centre lines of a long vehicle in bends, as (step, centre line)
 
     @property
     def last(self) -> int:
@@ -412,19 +368,12 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Paths(Serializable):
-    """The recorded paths of several actors.
+    """The recorded paths of several actors."""
 
-    Args:
-        time_s: simulation time before the first step, in s.
-        steps: number of steps; there is one more state, the state before the first step.
-        agents: paths of the controlled vehicles.
-        others: paths of all other actors, in the order of their appearance.
-    """
-
-    time_s: float
-    steps: int
-    agents: tuple[Path, ...]
-    others: tuple[Path, ...]
+    time_s: float  # simulation time before the first step, in s
+    steps: int  # number of steps; there is one more state, the state before the first step
+    agents: tuple[Path, ...]  # paths of the controlled vehicles
+    others: tuple[Path, ...]  # paths of all other actors, in the order of their appearance
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -43,19 +43,12 @@ _IGNORE_ERROR_OPTIONS = ("--ignore-errors", "--ignore-errors.connections")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConvertOptions:
-    """The options of the conversion of a map to a network.
+    """The options of the conversion of a map to a network."""
 
-    Args:
-        bbox: bounding box of the part of the map to convert, in degrees; None for the whole map.
-        people: whether the network has sidewalks and crossings.
-        bicycles: whether the network has lanes and paths for bicycles.
-        left_hand: whether traffic drives on the left.
-    """
-
-    bbox: BBox | None = None
-    people: bool = False
-    bicycles: bool = False
-    left_hand: bool = False
+    bbox: BBox | None = None  # bounding box of the part of the map to convert, in degrees; None for the whole map
+    people: bool = False  # whether the network has sidewalks and crossings
+    bicycles: bool = False  # whether the network has lanes and paths for bicycles
+    left_hand: bool = False  # whether traffic drives on the left
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,71 +164,41 @@ _KMH = 3.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOptions:
-    """The options of a scenario that is made from a map.
+    """The options of a scenario that is made from a map."""
 
-    Args:
-        bbox: bounding box of the part of the map to convert, in degrees; None for the whole map.
-        demand: the smallest and the largest traffic factor.
-        people: whether pedestrians walk, on sidewalks and crossings.
-        bicycles: whether cyclists ride.
-        left_hand: whether traffic drives on the left.
-        agent: agent that drives; by default crashhunt's car-following agent.
-        workflow: name of the CI system for which a workflow is written; empty for none.
-        picture: whether ``map.png`` is drawn.
-    """
-
-    bbox: BBox | None = None
-    demand: tuple[float, float] = DEMAND
-    people: bool = False
-    bicycles: bool = False
-    left_hand: bool = False
-    agent: str = ""
-    workflow: Literal["", "github"] = ""
-    picture: bool = True
+    bbox: BBox | None = None  # bounding box of the part of the map to convert, in degrees; None for the whole map
+    demand: tuple[float, float] = DEMAND  # the smallest and the largest traffic factor
+    people: bool = False  # whether pedestrians walk, on sidewalks and crossings
+    bicycles: bool = False  # whether cyclists ride
+    left_hand: bool = False  # whether traffic drives on the left
+    agent: str = ""  # agent that drives; by default crashhunt's car-following agent
+    workflow: Literal["", "github"] = ""  # name of the CI system for which a workflow is written; empty for none
+    picture: bool = True  # whether ``map.png`` is drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlainTrial:
-    """The result of one trial in the new scenario.
+    """The result of one trial in the new scenario."""
 
-    Args:
-        outcome: outcome of the trial.
-        steps: number of steps.
-        wall_s: wall time of the trial in s, including the start of its processes.
-    """
-
-    outcome: str
-    steps: int
-    wall_s: float
+    outcome: str  # outcome of the trial
+    steps: int  # number of steps
+    wall_s: float  # wall time of the trial in s, including the start of its processes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeScenario:
-    """A scenario that was made from a map and then checked.
+    """A scenario that was made from a map and then checked."""
 
-    Args:
-        folder: folder of the scenario.
-        source: the map from which the scenario was made.
-        network: contents of the network.
-        demand: traffic of the scenario.
-        plain: result of the traffic at its usual demand.
-        busy: result of the traffic at its largest demand.
-        steps: maximum number of steps of a trial, derived from the longest route.
-        notes: notes for the user.
-        trial: the result of one trial; None if none ran.
-        agent: agent of the trial.
-    """
-
-    folder: Path
-    source: MapSource
-    network: RoadNetwork
-    demand: Demand
-    plain: PlainRun
-    busy: PlainRun
-    steps: int
-    notes: tuple[str, ...] = ()
-    trial: PlainTrial | None = None
-    agent: str = ""
+    folder: Path  # folder of the scenario
+    source: MapSource  # the map from which the scenario was made
+    network: RoadNetwork  # contents of the network
+    demand: Demand  # traffic of the scenario
+    plain: PlainRun  # result of the traffic at its usual demand
+    busy: PlainRun  # result of the traffic at its largest demand
+    steps: int  # maximum number of steps of a trial, derived from the longest route
+    notes: tuple[str, ...] = ()  # notes for the user
+    trial: PlainTrial | None = None  # the result of one trial; None if none ran
+    agent: str = ""  # agent of the trial
     commands: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, object]:

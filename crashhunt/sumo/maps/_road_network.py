@@ -21,26 +21,17 @@ DEFAULT_WIDTH_M = 3.2  # SUMO's, of a lane without a width
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkLane:
-    """One lane of a road.
+    """One lane of a road."""
 
-    Args:
-        length_m: length of the lane, in m.
-        speed_mps: the speed limit, in m/s.
-        allowed: the vehicle classes that may use the lane; None for all.
-        disallowed: the vehicle classes that may not use the lane.
-        shape: centre line of the lane, in m.
-        width_m: width of the lane, in m.
-        change_up: the vehicle classes that may change to the lane with the next index; None for all.
-        change_down: the vehicle classes that may change to the lane with the previous index; None for all.
-    """
-
-    length_m: float
-    speed_mps: float
-    allowed: frozenset[str] | None
-    disallowed: frozenset[str]
-    shape: tuple[Point, ...]
-    width_m: float = DEFAULT_WIDTH_M
+    length_m: float  # length of the lane, in m
+    speed_mps: float  # the speed limit, in m/s
+    allowed: frozenset[str] | None  # the vehicle classes that may use the lane; None for all
+    disallowed: frozenset[str]  # the vehicle classes that may not use the lane
+    shape: tuple[Point, ...]  # centre line of the lane, in m
+    width_m: float = DEFAULT_WIDTH_M  # width of the lane, in m
+    # the vehicle classes that may change to the lane with the next index; None for all
     change_up: frozenset[str] | None = None
+    # the vehicle classes that may change to the lane with the previous index; None for all
     change_down: frozenset[str] | None = None
 
     def admits(self, vehicle_class: str) -> bool:
@@ -52,19 +43,12 @@ class NetworkLane:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A road in one direction, from one junction to the next.
+    """A road in one direction, from one junction to the next."""
 
-    Args:
-        id: SUMO's id of the road.
-        name: name of the street; empty if the map has none.
-        lanes: lanes from right to left in right-hand traffic.
-        ends: ids of the junctions from which and to which it leads; empty inside junctions.
-    """
-
-    id: str
-    name: str
-    lanes: tuple[NetworkLane, ...]
-    ends: tuple[str, str] = ("", "")
+    id: str  # SUMO's id of the road
+    name: str  # name of the street; empty if the map has none
+    lanes: tuple[NetworkLane, ...]  # lanes from right to left in right-hand traffic
+    ends: tuple[str, str] = ("", "")  # ids of the junctions from which and to which it leads; empty inside junctions
 
     def admits(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may use a lane of the road."""
@@ -82,45 +66,27 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Connection:
-    """A connection from a lane to a following lane.
+    """A connection from a lane to a following lane."""
 
-    Args:
-        source: the lane from which the connection starts; it may be inside a junction.
-        target: the lane to which the connection leads; it is never inside a junction.
-        via: the next lane inside the junction; empty if there is none.
-        signal: id of the traffic light that controls the connection; empty if there is none.
-        signal_index: index of the connection in the state of the traffic light; -1 if there is none.
-        direction: direction of the turn: ``s`` straight, ``l`` left, ``r`` right, ``t`` turnaround and so on.
-        state: state of the connection, as in SUMO: ``M`` major, ``m`` minor, ``=`` equal, ``s`` stop, ``w`` all-way
-            stop.
-    """
-
-    source: str
-    target: str
-    via: str
-    signal: str
-    signal_index: int
-    direction: str
+    source: str  # the lane from which the connection starts; it may be inside a junction
+    target: str  # the lane to which the connection leads; it is never inside a junction
+    via: str  # the next lane inside the junction; empty if there is none
+    signal: str  # id of the traffic light that controls the connection; empty if there is none
+    signal_index: int  # index of the connection in the state of the traffic light; -1 if there is none
+    direction: str  # direction of the turn: ``s`` straight, ``l`` left, ``r`` right, ``t`` turnaround and so on
+    # state of the connection, as in SUMO: ``M`` major, ``m`` minor, ``=`` equal, ``s`` stop, ``w`` all-way stop
     state: str
 
 
 @dataclass(frozen=True, slots=True)
 class Junction:
-    """The rules of a junction.
+    """The rules of a junction."""
 
-    Args:
-        id: id of the junction.
-        type: type of the junction, such as ``priority`` or ``traffic_light``.
-        inside: the last lane inside the junction of each path across it, in the order of the rules.
-        yields: for each path, the indices of the paths that it has to yield to.
-        foes: for each path, the indices of the paths that it conflicts with.
-    """
-
-    id: str
-    type: str
-    inside: tuple[str, ...]
-    yields: Mapping[int, frozenset[int]]
-    foes: Mapping[int, frozenset[int]]
+    id: str  # id of the junction
+    type: str  # type of the junction, such as ``priority`` or ``traffic_light``
+    inside: tuple[str, ...]  # the last lane inside the junction of each path across it, in the order of the rules
+    yields: Mapping[int, frozenset[int]]  # for each path, the indices of the paths that it has to yield to
+    foes: Mapping[int, frozenset[int]]  # for each path, the indices of the paths that it conflicts with
 
 
 @dataclass(slots=True)

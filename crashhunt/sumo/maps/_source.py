@@ -39,16 +39,11 @@ _CHUNK_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSource:
-    """The source of a map: a file or a shape.
+    """The source of a map: a file or a shape."""
 
-    Args:
-        kind: format of the map file, or kind of the generated map.
-        path: path of the file; None if the map is generated.
-        shape: shape of a generated map: columns and rows of a grid, or arms and rings of a spider web.
-    """
-
-    kind: Kind
-    path: Path | None = None
+    kind: Kind  # format of the map file, or kind of the generated map
+    path: Path | None = None  # path of the file; None if the map is generated
+    # shape of a generated map: columns and rows of a grid, or arms and rings of a spider web
     shape: tuple[int, int] = (0, 0)
 
     @property

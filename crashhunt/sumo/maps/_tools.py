@@ -37,15 +37,10 @@ class ToolResult:
 
 @dataclass(frozen=True, slots=True)
 class Tools:
-    """An installation of eclipse-sumo.
+    """An installation of eclipse-sumo."""
 
-    Args:
-        home: the folder that SUMO's documentation calls SUMO_HOME.
-        version: version of the distribution, such as ``1.28.0``.
-    """
-
-    home: Path
-    version: str
+    home: Path  # the folder that SUMO's documentation calls SUMO_HOME
+    version: str  # version of the distribution, such as ``1.28.0``
 
     def run(self, program: str, words: Sequence[str], folder: Path) -> ToolResult:
         """Run a program to its end.

@@ -42,38 +42,23 @@ _MAX_PER_LANE_PER_HOUR = 800.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Route:
-    """A route through the network that vehicles take.
+    """A route through the network that vehicles take."""
 
-    Args:
-        id: id of the route, such as ``r7``.
-        edges: ids of the route's edges.
-        weight: number of drawn trips on this route.
-        length_m: length of the route, in m.
-        free_s: travel time on the route without other traffic, in s.
-    """
-
-    id: str
-    edges: tuple[str, ...]
-    weight: int
-    length_m: float
-    free_s: float
+    id: str  # id of the route, such as ``r7``
+    edges: tuple[str, ...]  # ids of the route's edges
+    weight: int  # number of drawn trips on this route
+    length_m: float  # length of the route, in m
+    free_s: float  # travel time on the route without other traffic, in s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """The traffic in a network.
+    """The traffic in a network."""
 
-    Args:
-        routes: routes of vehicles.
-        vehicles_per_hour: vehicles per hour on all routes together, at demand 1.
-        walks: for each flow of pedestrians, the edges along which they walk.
-        ego_routes: ids of the routes from which the route of the controlled vehicle is drawn.
-    """
-
-    routes: tuple[Route, ...]
-    vehicles_per_hour: float
-    walks: tuple[tuple[str, ...], ...]
-    ego_routes: tuple[str, ...]
+    routes: tuple[Route, ...]  # routes of vehicles
+    vehicles_per_hour: float  # vehicles per hour on all routes together, at demand 1
+    walks: tuple[tuple[str, ...], ...]  # for each flow of pedestrians, the edges along which they walk
+    ego_routes: tuple[str, ...]  # ids of the routes from which the route of the controlled vehicle is drawn
 
     def rates(self) -> Iterator[tuple[Route, float]]:
         """Yield each route with its vehicles per hour at demand 1."""
@@ -248,35 +233,20 @@ _MAX_PROBE_DELAY_S = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlainRun(Serializable):
-    """The result of a simulation of the traffic without an agent for `RUN_S` seconds.
+    """The result of a simulation of the traffic without an agent for `RUN_S` seconds."""
 
-    Args:
-        demand: traffic factor.
-        wanted: number of vehicles that should have entered.
-        entered: number of vehicles that entered.
-        arrived: number of vehicles that reached their destination.
-        running: number of vehicles on the road at the end.
-        halting: number of these vehicles that stood still.
-        teleports: number of vehicles that SUMO teleported after they had stood still for 300 s.
-        collisions: number of collisions between vehicles of the traffic.
-        mean_speed_mps: mean speed of the vehicles that arrived, in m/s.
-        persons: number of pedestrians.
-        edge_vehicles: number of vehicles that entered each road.
-        probe_delays_s: time that a probe vehicle waited to enter on each route, in s; routes without such a vehicle are
-            missing.
-    """
-
-    demand: float
-    wanted: int
-    entered: int
-    arrived: int
-    running: int
-    halting: int
-    teleports: int
-    collisions: int
-    mean_speed_mps: float
-    persons: int
-    edge_vehicles: Mapping[str, float] = field(default_factory=dict)
+    demand: float  # traffic factor
+    wanted: int  # number of vehicles that should have entered
+    entered: int  # number of vehicles that entered
+    arrived: int  # number of vehicles that reached their destination
+    running: int  # number of vehicles on the road at the end
+    halting: int  # number of these vehicles that stood still
+    teleports: int  # number of vehicles that SUMO teleported after they had stood still for 300 s
+    collisions: int  # number of collisions between vehicles of the traffic
+    mean_speed_mps: float  # mean speed of the vehicles that arrived, in m/s
+    persons: int  # number of pedestrians
+    edge_vehicles: Mapping[str, float] = field(default_factory=dict)  # number of vehicles that entered each road
+    # time that a probe vehicle waited to enter on each route, in s; routes without such a vehicle are missing
     probe_delays_s: Mapping[str, float] = field(default_factory=dict)
 
     json_keys = (
