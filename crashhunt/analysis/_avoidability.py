@@ -57,19 +57,12 @@ class CannotError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """One run with the agent overruled.
+    """One run with the agent overruled."""
 
-    Args:
-        step: the step after which the agent was overruled.
-        ending: what happened to the collision.
-        deceleration: the greatest deceleration of the agent, in m/s².
-        changed: Further differences in the agent's behaviour, in addition to the manoeuvre.
-    """
-
-    step: int
-    ending: Ending
-    deceleration: float = 0.0
-    changed: tuple[str, ...] = ()
+    step: int  # the step after which the agent was overruled
+    ending: Ending  # what happened to the collision
+    deceleration: float = 0.0  # the greatest deceleration of the agent, in m/s²
+    changed: tuple[str, ...] = ()  # further differences in the agent's behaviour, in addition to the manoeuvre
 
 
 class _Enough(Exception):  # noqa: N818 - no error

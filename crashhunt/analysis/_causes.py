@@ -47,19 +47,12 @@ _MIN_SPEED_CHANGE_MPS = 1.0  # m/s in all; less makes no difference
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """A manoeuvre of an actor.
+    """A manoeuvre of an actor."""
 
-    Args:
-        actor: identifier of the actor.
-        what: either ``braked``, ``sped up`` or ``changed lanes``.
-        step: the step after which the manoeuvre began.
-        speed: speed of the actor after this step, in m/s.
-    """
-
-    actor: str
-    what: str
-    step: int
-    speed: float
+    actor: str  # identifier of the actor
+    what: str  # either ``braked``, ``sped up`` or ``changed lanes``
+    step: int  # the step after which the manoeuvre began
+    speed: float  # speed of the actor after this step, in m/s
 
 
 def relevant_actors(recording: Recording, agent: str, other: str, most: int) -> list[str]:
@@ -151,19 +144,13 @@ _FACULTY_BY_MANOEUVRE = {"braked": "speed", "sped up": "speed", "changed lanes":
 
 @dataclass(slots=True)
 class _Candidate:
-    """A candidate cause, and the runs without it.
+    """A candidate cause, and the runs without it."""
 
-    Args:
-        factor: description of the candidate.
-        runs: the trials without the candidate, each as the changed value and the trial's specification.
-        inside: Whether the candidate is suppressed within the episode, from the given step on.
-        held: The actor whose speed is held constant in the runs; empty if there is none.
-    """
-
-    factor: Factor
+    factor: Factor  # description of the candidate
+    # the trials without the candidate, each as the changed value and the trial's specification
     runs: Sequence[tuple[Value, TrialSpec]]
-    inside: bool = False
-    held: str = ""
+    inside: bool = False  # whether the candidate is suppressed within the episode, from the given step on
+    held: str = ""  # the actor whose speed is held constant in the runs; empty if there is none
     endings: dict[int, LeftOut] = field(default_factory=dict)
 
     @property

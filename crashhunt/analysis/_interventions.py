@@ -71,13 +71,9 @@ class SetArguments:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disturb:
-    """Disturbances in addition to those of the trial.
+    """Disturbances in addition to those of the trial."""
 
-    Args:
-        disturbances: the disturbances; at least one.
-    """
-
-    disturbances: tuple[Disturbance, ...]
+    disturbances: tuple[Disturbance, ...]  # the disturbances; at least one
 
     @property
     def from_step(self) -> int:
@@ -95,19 +91,14 @@ class Disturb:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overrule:
-    """An agent that is overruled: its actions are replaced.
+    """An agent that is overruled: its actions are replaced."""
 
-    Args:
-        from_step: the last step that stays as recorded.
-        manoeuvre: the manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and
-            brake, or ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a
-            reference driver corrects unsafe speeds, unsafe lane changes, or both.
-        agent: id of the agent; empty for the only agent.
-    """
-
-    from_step: int
+    from_step: int  # the last step that stays as recorded
+    # the manoeuvre: ``brake`` as hard as the vehicle can, change lanes to the ``left`` or ``right`` and brake, or
+    # ``keep_lane`` or ``keep_speed``. With ``reference_speed``, ``reference_lanes`` or ``reference``, a reference
+    # driver corrects unsafe speeds, unsafe lane changes, or both.
     manoeuvre: Manoeuvre = "brake"
-    agent: str = ""
+    agent: str = ""  # id of the agent; empty for the only agent
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run with the agent overruled."""
@@ -165,20 +156,14 @@ class HandOver:
 
     Up to this step, the recorded actions are repeated, and no code of the agent runs. Then the new agent is reset with
     the seed of the trial. The first observation that the new agent receives is the observation after this step.
-
-    Args:
-        from_step: number of recorded actions to repeat.
-        driver: the new agent, as ``module:Name``; empty for the recorded agent.
-        arguments: arguments of the new agent. For the recorded agent, all other arguments keep their recorded values.
-        agent: id of the vehicle; empty for the only controlled vehicle.
-        option: option with which the user gave the arguments, for error messages.
     """
 
-    from_step: int
-    driver: str = ""
+    from_step: int  # number of recorded actions to repeat
+    driver: str = ""  # the new agent, as ``module:Name``; empty for the recorded agent
+    # arguments of the new agent. For the recorded agent, all other arguments keep their recorded values.
     arguments: Mapping[str, str] = field(default_factory=dict)
-    agent: str = ""
-    option: str = "--arg"
+    agent: str = ""  # id of the vehicle; empty for the only controlled vehicle
+    option: str = "--arg"  # option with which the user gave the arguments, for error messages
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run in which the new agent takes control."""
@@ -210,13 +195,9 @@ class HandOver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reseed:
-    """Other seeds of the simulator's random generators after a step; each run has a different seed.
+    """Other seeds of the simulator's random generators after a step; each run has a different seed."""
 
-    Args:
-        from_step: the last step whose random numbers come from the seed of the trial.
-    """
-
-    from_step: int
+    from_step: int  # the last step whose random numbers come from the seed of the trial
 
     def applied(self, rerun: Rerun) -> Rerun:
         """Return the run unchanged, because the engine gives each run its seed."""

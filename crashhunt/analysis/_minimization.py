@@ -36,37 +36,22 @@ _DISK_FIX = "free some space and run the same command again, which reuses the re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shrunk(Serializable):
-    """The result of a minimization.
+    """The result of a minimization."""
 
-    Args:
-        bundle: bundle of the original crash.
-        verdict: whether the crash was minimized, cannot be minimized, or did not reproduce.
-        ended: how the minimization ended.
-        small: the minimized crash; None if nothing was removed.
-        why: the reason for the end, as text.
-        actors: number of actors in the scenes before and after the minimization, including agents.
-        agents: number of agents in the scenes before and after the minimization.
-        trials: number of runs.
-        steps: total number of simulated steps in these runs.
-        removed: the removed actors and disturbances.
-        changed: arguments with a new value: old and new value by name.
-        steps_cut: number of steps that were removed from the beginning.
-        notes: notes on possible causes of different results, as text.
-    """
-
-    bundle: Bundle
-    verdict: Verdict
-    ended: Ended
-    small: Bundle | None = None
-    why: str
-    actors: tuple[int, int]
-    agents: tuple[int, int]
-    trials: int
-    steps: int
-    removed: tuple[str, ...] = ()
+    bundle: Bundle  # bundle of the original crash
+    verdict: Verdict  # whether the crash was minimized, cannot be minimized, or did not reproduce
+    ended: Ended  # how the minimization ended
+    small: Bundle | None = None  # the minimized crash; None if nothing was removed
+    why: str  # the reason for the end, as text
+    actors: tuple[int, int]  # number of actors in the scenes before and after the minimization, including agents
+    agents: tuple[int, int]  # number of agents in the scenes before and after the minimization
+    trials: int  # number of runs
+    steps: int  # total number of simulated steps in these runs
+    removed: tuple[str, ...] = ()  # the removed actors and disturbances
+    # arguments with a new value: old and new value by name
     changed: Mapping[str, tuple[Value | None, Value | None]] = field(default_factory=dict)
-    steps_cut: int = 0
-    notes: tuple[str, ...]
+    steps_cut: int = 0  # number of steps that were removed from the beginning
+    notes: tuple[str, ...]  # notes on possible causes of different results, as text
 
     json_keys = (
         "crash=bundle.id", "path=small.path", "verdict", "ended", "why", "signature_kept", "confirmed=after.confirmed",

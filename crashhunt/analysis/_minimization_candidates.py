@@ -34,17 +34,11 @@ _SEEN_LONGER_S = 1.0  # by which the crash may come later than it did: the other
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The actors of a crash that remain in a candidate.
+    """The actors of a crash that remain in a candidate."""
 
-    Args:
-        agents: identifiers of the agents that drive themselves.
-        others: identifiers of the actors that follow recorded paths; they may include agents.
-        begin: the step of the recording at which the candidate begins.
-    """
-
-    agents: tuple[str, ...]
-    others: tuple[str, ...]
-    begin: int = 0
+    agents: tuple[str, ...]  # identifiers of the agents that drive themselves
+    others: tuple[str, ...]  # identifiers of the actors that follow recorded paths; they may include agents
+    begin: int = 0  # the step of the recording at which the candidate begins
 
     @property
     def count(self) -> int:

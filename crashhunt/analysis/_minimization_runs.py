@@ -26,17 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Ran:
-    """The result of a minimization candidate.
+    """The result of a minimization candidate."""
 
-    Args:
-        same: whether the candidate crashes in the same manner as the original.
-        steps: number of steps of the candidate's run.
-        digest: digest of the run's recording.
-    """
-
-    same: bool
-    steps: int
-    digest: str
+    same: bool  # whether the candidate crashes in the same manner as the original
+    steps: int  # number of steps of the candidate's run
+    digest: str  # digest of the run's recording
 
 
 class Runs:

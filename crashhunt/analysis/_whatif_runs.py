@@ -55,26 +55,16 @@ _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WhatIfOptions:
-    """Options of what-if runs.
+    """Options of what-if runs."""
 
-    Args:
-        code: the code that drives: the code of the ``snapshot``, or the ``current`` code.
-        times: number of runs; 0 means `FUTURES` runs if futures are requested, and otherwise one run.
-        parallel: number of runs at a time.
-        time_s: wall-time limit of all runs, in s; None for no limit.
-        trusted: whether the code of the crash may run; None to determine it.
-        force: whether to run even from a damaged snapshot.
-        watch: function called with the number of finished runs and the number of all runs.
-        stopped: function that returns whether to stop; called repeatedly.
-    """
-
-    code: Code = "snapshot"
-    times: int = 0
-    parallel: int = 1
-    time_s: float | None = None
-    trusted: bool | None = None
-    force: bool = False
-    watch: Watch | None = None
+    code: Code = "snapshot"  # the code that drives: the code of the ``snapshot``, or the ``current`` code
+    times: int = 0  # number of runs; 0 means `FUTURES` runs if futures are requested, and otherwise one run
+    parallel: int = 1  # number of runs at a time
+    time_s: float | None = None  # wall-time limit of all runs, in s; None for no limit
+    trusted: bool | None = None  # whether the code of the crash may run; None to determine it
+    force: bool = False  # whether to run even from a damaged snapshot
+    watch: Watch | None = None  # function called with the number of finished runs and the number of all runs
+    # function that returns whether to stop; called repeatedly
     stopped: Callable[[], bool] = field(default=lambda: False)
 
 
@@ -286,55 +276,35 @@ def _equal_futures(runs: Iterable[Run]) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run(Serializable):
-    """The result of one run.
+    """The result of one run."""
 
-    Args:
-        number: number of the run among the requested runs, counted from 0.
-        outcome: outcome of the run.
-        steps: number of completed steps.
-        digest: digest of the run's recording; runs with equal digests are bit-identical.
-        crashed: whether the hunt counts the outcome as a crash.
-        excluded: reason why the run does not count; empty if it counts.
-    """
-
-    number: int
-    outcome: Outcome
-    steps: int
-    digest: str
-    crashed: bool
-    excluded: str = ""
+    number: int  # number of the run among the requested runs, counted from 0
+    outcome: Outcome  # outcome of the run
+    steps: int  # number of completed steps
+    digest: str  # digest of the run's recording; runs with equal digests are bit-identical
+    crashed: bool  # whether the hunt counts the outcome as a crash
+    excluded: str = ""  # reason why the run does not count; empty if it counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts(Serializable):
-    """The counted runs of one question.
+    """The counted runs of one question."""
 
-    Args:
-        crash: the id of the crash.
-        interventions: the changes of the trial, as text.
-        from_step: the step up to which each counted run was bit-identical to the recording; None if the change holds
-            from the start, so that no step is compared.
-        code: the code that drove, ``snapshot`` or ``current``.
-        recorded_outcome: the outcome of the recorded trial.
-        recorded_steps: number of steps of the recorded trial.
-        asked: number of requested runs.
-        each: the runs, by number.
-        interrupted: the reason why `each` has fewer runs than requested; empty if all runs finished. After an
-            interruption, `each` ends before the first unfinished run: short runs finish first, so counting all finished
-            runs would favour early crashes.
-        warnings: warnings about possible causes of different results, as text.
-    """
-
-    crash: str
-    interventions: tuple[str, ...]
+    crash: str  # the id of the crash
+    interventions: tuple[str, ...]  # the changes of the trial, as text
+    # the step up to which each counted run was bit-identical to the recording; None if the change holds from the start,
+    # so that no step is compared
     from_step: int | None
-    code: str
-    recorded_outcome: Outcome
-    recorded_steps: int
-    asked: int
-    each: tuple[Run, ...]
+    code: str  # the code that drove, ``snapshot`` or ``current``
+    recorded_outcome: Outcome  # the outcome of the recorded trial
+    recorded_steps: int  # number of steps of the recorded trial
+    asked: int  # number of requested runs
+    each: tuple[Run, ...]  # the runs, by number
+    # the reason why `each` has fewer runs than requested; empty if all runs finished. After an interruption, `each`
+    # ends before the first unfinished run: short runs finish first, so counting all finished runs would favour early
+    # crashes.
     interrupted: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # warnings about possible causes of different results, as text
 
     json_keys = (
         "crash", "interventions", "from_step", "code", "recorded_outcome", "recorded_steps", "asked", "runs",

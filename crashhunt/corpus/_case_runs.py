@@ -36,28 +36,18 @@ _HARMLESS_OUTCOMES = (Outcome.SURVIVED, Outcome.FINISHED)
 
 @dataclass(frozen=True, slots=True)
 class CaseReport(Serializable):
-    """The result of running a case.
+    """The result of running a case."""
 
-    Args:
-        path: The folder of the case.
-        expected: The expected status.
-        got: The actual status: ``still`` (reproduces with the same crash type), ``fixed``, ``changed`` (another crash
-            type) or ``cannot_run``.
-        was: A description of the recorded crash.
-        now: A description of the current result, or the reason why the case cannot run.
-        note: The user's note.
-        warnings: Differences other than the code that may change the result.
-        kept: The bundle of the current crash, if it was kept.
-    """
-
-    path: Path
-    expected: Expectation
+    path: Path  # the folder of the case
+    expected: Expectation  # the expected status
+    # the actual status: ``still`` (reproduces with the same crash type), ``fixed``, ``changed`` (another crash type) or
+    # ``cannot_run``
     got: Got
-    was: str = ""
-    now: str = ""
-    note: str = ""
-    warnings: tuple[str, ...] = ()
-    kept: Path | None = None
+    was: str = ""  # a description of the recorded crash
+    now: str = ""  # a description of the current result, or the reason why the case cannot run
+    note: str = ""  # the user's note
+    warnings: tuple[str, ...] = ()  # differences other than the code that may change the result
+    kept: Path | None = None  # the bundle of the current crash, if it was kept
 
     json_keys = ("path", "expected", "got", "ok", "may_be_tightened", "was", "now", "warnings", "kept?")
 

@@ -67,21 +67,13 @@ class _File:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case of a corpus, stored on disk.
+    """A case of a corpus, stored on disk."""
 
-    Args:
-        path: The folder of the case.
-        expect: The expected status: ``still`` (reproduces) or ``fixed``.
-        note: A note of the user.
-        crash: A description of the crash.
-        signature: The parts of the crash's signature by name; later versions may add parts.
-    """
-
-    path: Path
-    expect: Expectation
-    note: str
-    crash: str
-    signature: dict[str, str | bool]
+    path: Path  # the folder of the case
+    expect: Expectation  # the expected status: ``still`` (reproduces) or ``fixed``
+    note: str  # a note of the user
+    crash: str  # a description of the crash
+    signature: dict[str, str | bool]  # the parts of the crash's signature by name; later versions may add parts
 
     @property
     def name(self) -> str:
@@ -203,19 +195,12 @@ _MAX_BYTES_OF_OBSERVATIONS = 50 * 1024  # raw; images have more, and only their 
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """The result of adding a crash to a corpus.
+    """The result of adding a crash to a corpus."""
 
-    Args:
-        case: The case in the corpus.
-        new: Whether the case is new in the corpus.
-        changed: Whether the expectation or the note of a present case changed.
-        judged: Whether a present case has got the causes of the crash.
-    """
-
-    case: Case
-    new: bool
-    changed: bool = False
-    judged: bool = False
+    case: Case  # the case in the corpus
+    new: bool  # whether the case is new in the corpus
+    changed: bool = False  # whether the expectation or the note of a present case changed
+    judged: bool = False  # whether a present case has got the causes of the crash
 
 
 def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None, note: str | None = None) -> Added:
@@ -366,16 +351,11 @@ def _facts(bundle: Bundle, recording: Recording) -> tuple[object, ...]:
 
 @dataclass(frozen=True, slots=True)
 class KnownType:
-    """A crash type of which the corpus has cases that are expected to reproduce, and the causes of its crashes.
+    """A crash type of which the corpus has cases that are expected to reproduce, and the causes of its crashes."""
 
-    Args:
-        case: the first of these cases.
-        by: ``cause`` if the causes of crashes and cases were compared, else ``type``.
-        new_causes: causes of crashes that none of the cases has; with such a cause, the type has new crashes.
-    """
-
-    case: Case
-    by: Literal["cause", "type"]
+    case: Case  # the first of these cases
+    by: Literal["cause", "type"]  # ``cause`` if the causes of crashes and cases were compared, else ``type``
+    # causes of crashes that none of the cases has; with such a cause, the type has new crashes
     new_causes: tuple[Cause, ...] = ()
 
 

@@ -31,17 +31,11 @@ _MIN_UNDER_WAY = 64  # trials, for hunts that did not record how many were under
 
 @dataclass(frozen=True, slots=True)
 class CodeVersions:
-    """The versions of the code with which the trials of a hunt ran.
+    """The versions of the code with which the trials of a hunt ran."""
 
-    Args:
-        snapshots: digests of the snapshots of each version, the first version first.
-        place: place of the newest version, the version that ran last.
-        first: number of the first trial that counts for the newest version.
-    """
-
-    snapshots: tuple[tuple[str, ...], ...] = ()
-    place: int = 0
-    first: int = 0
+    snapshots: tuple[tuple[str, ...], ...] = ()  # digests of the snapshots of each version, the first version first
+    place: int = 0  # place of the newest version, the version that ran last
+    first: int = 0  # number of the first trial that counts for the newest version
 
     @classmethod
     def of(cls, facts: Facts) -> CodeVersions:
@@ -80,21 +74,13 @@ class CodeVersions:
 
 @dataclass(frozen=True, slots=True)
 class VersionCounts:
-    """The trials of one version of the code.
+    """The trials of one version of the code."""
 
-    Args:
-        version: number of the version, from 1 on.
-        is_newest: whether the version ran last.
-        first: for the newest version, number of the first trial that counts for figures; else None.
-        trials: number of finished trials.
-        crashes: number of these trials that crashed.
-    """
-
-    version: int
-    is_newest: bool
-    first: int | None
-    trials: int
-    crashes: int
+    version: int  # number of the version, from 1 on
+    is_newest: bool  # whether the version ran last
+    first: int | None  # for the newest version, number of the first trial that counts for figures; else None
+    trials: int  # number of finished trials
+    crashes: int  # number of these trials that crashed
 
 
 def count_versions(ledger: Ledger, facts: Facts, crash_on: Collection[str]) -> tuple[VersionCounts, ...]:

@@ -47,20 +47,13 @@ _MAX_READ_LOGS = 200  # of crashes that are read for their types; a log takes 0.
 
 @dataclass(slots=True)
 class CrashTally:
-    """Counts the crashes of all trials of a hunt.
+    """Counts the crashes of all trials of a hunt."""
 
-    Args:
-        found: number of crashes.
-        disturbed: number of crashes with disturbances.
-        likeliest: identifier of the crash with disturbances that has the greatest log-likelihood; empty if there is
-            none.
-        log_likelihood: log-likelihood of this crash.
-    """
-
-    found: int = 0
-    disturbed: int = 0
+    found: int = 0  # number of crashes
+    disturbed: int = 0  # number of crashes with disturbances
+    # identifier of the crash with disturbances that has the greatest log-likelihood; empty if there is none
     likeliest: str = ""
-    log_likelihood: float = -math.inf
+    log_likelihood: float = -math.inf  # log-likelihood of this crash
 
     def add(self, result: TrialResult) -> None:
         """Add a crash to the counts."""
@@ -106,24 +99,16 @@ def outcomes_of_crashes(directory: Path, facts: Facts) -> Sequence[str] | None:
 
 @dataclass(frozen=True, slots=True)
 class FoundCrashes:
-    """The crashes of a hunt: their number, their types, and the crashes to show.
+    """The crashes of a hunt: their number, their types, and the crashes to show."""
 
-    Args:
-        tally: counts of the crashes over all trials.
-        saved: number of crashes that have a bundle.
-        types: number of crashes of each crash type (as text) over all trials, the most frequent type first.
-        shortest: identifier of the shortest saved crash of each crash type.
-        first: number of the trial in which each crash type occurred for the first time.
-        untyped: number of crashes whose type is unknown, because a log is missing or has not been read yet.
-        shown: the crashes to show: the shortest crash of each type, then the shortest of all other crashes.
-    """
-
-    tally: CrashTally
-    saved: int
+    tally: CrashTally  # counts of the crashes over all trials
+    saved: int  # number of crashes that have a bundle
+    # number of crashes of each crash type (as text) over all trials, the most frequent type first
     types: Mapping[str, int]
-    shortest: Mapping[str, str]
-    first: Mapping[str, int]
-    untyped: int
+    shortest: Mapping[str, str]  # identifier of the shortest saved crash of each crash type
+    first: Mapping[str, int]  # number of the trial in which each crash type occurred for the first time
+    untyped: int  # number of crashes whose type is unknown, because a log is missing or has not been read yet
+    # the crashes to show: the shortest crash of each type, then the shortest of all other crashes
     shown: tuple[Bundle, ...]
 
 
@@ -236,17 +221,11 @@ def _listed_crashes(
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A crash whose cause has been searched for.
+    """A crash whose cause has been searched for."""
 
-    Args:
-        bundle: bundle of the crash, with its judgement.
-        cause: the cause; None if the crash cannot be run again.
-        is_stopped: whether the search was interrupted, so that the cause is unknown.
-    """
-
-    bundle: Bundle
-    cause: Cause | None = None
-    is_stopped: bool = False
+    bundle: Bundle  # bundle of the crash, with its judgement
+    cause: Cause | None = None  # the cause; None if the crash cannot be run again
+    is_stopped: bool = False  # whether the search was interrupted, so that the cause is unknown
 
 
 class Kinds:

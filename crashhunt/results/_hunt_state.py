@@ -34,60 +34,36 @@ PROBES, BRANCHES, RARE = "probes", "branches", "rare"
 
 
 class ProbeSums(TypedDict):
-    """The results of the robustness probes of a hunt in ``status --json``.
+    """The results of the robustness probes of a hunt in ``status --json``."""
 
-    Args:
-        trials: number of trials in which all probes have a result.
-        not_fully_asked: number of further trials in which a probe has no result.
-        least: the smallest robustness margin of the trials in which all probes have a result; None if there is no such
-            trial.
-        trial: the number of the trial with the smallest margin; None if there is no such trial.
-        probes: number of probes.
-        steps: number of simulated steps of the forks.
-        left_out: number of probes that were skipped because the forks had used up their steps.
-        crashed_trials: number of trials without a crash in which a probe crashed.
-        run_again: number of the mildest crashing disturbances that were run from the start; None before these runs.
-        confirmed: number of these runs that crashed.
-    """
-
-    trials: int
-    not_fully_asked: int
+    trials: int  # number of trials in which all probes have a result
+    not_fully_asked: int  # number of further trials in which a probe has no result
+    # the smallest robustness margin of the trials in which all probes have a result; None if there is no such trial
     least: float | None
-    trial: int | None
-    probes: int
-    steps: int
-    left_out: int
-    crashed_trials: int
+    trial: int | None  # the number of the trial with the smallest margin; None if there is no such trial
+    probes: int  # number of probes
+    steps: int  # number of simulated steps of the forks
+    left_out: int  # number of probes that were skipped because the forks had used up their steps
+    crashed_trials: int  # number of trials without a crash in which a probe crashed
+    # number of the mildest crashing disturbances that were run from the start; None before these runs
     run_again: int | None
-    confirmed: int | None
+    confirmed: int | None  # number of these runs that crashed
 
 
 class BranchSums(TypedDict):
-    """The results of the branches of a hunt in ``status --json``, with fields as in `ProbeSums`.
+    """The results of the branches of a hunt in ``status --json``, with fields as in `ProbeSums`."""
 
-    Args:
-        trials: number of trials in which branches were possible.
-        moments: number of steps after which forks continued.
-        branches: number of branches.
-        steps: number of simulated steps of the forks.
-        left_out: number of branches that were skipped because the forks had used up their steps.
-        crashed: number of branches that crashed.
-        crashed_trials: number of trials with a crashed branch.
-        not_fully_asked: number of trials in which a branch has no result.
-        run_again: number of the likeliest crashed branches that were run from the start; None before these runs.
-        confirmed: number of these runs that crashed.
-    """
-
-    trials: int
-    moments: int
-    branches: int
-    steps: int
-    left_out: int
-    crashed: int
-    crashed_trials: int
-    not_fully_asked: int
+    trials: int  # number of trials in which branches were possible
+    moments: int  # number of steps after which forks continued
+    branches: int  # number of branches
+    steps: int  # number of simulated steps of the forks
+    left_out: int  # number of branches that were skipped because the forks had used up their steps
+    crashed: int  # number of branches that crashed
+    crashed_trials: int  # number of trials with a crashed branch
+    not_fully_asked: int  # number of trials in which a branch has no result
+    # number of the likeliest crashed branches that were run from the start; None before these runs
     run_again: int | None
-    confirmed: int | None
+    confirmed: int | None  # number of these runs that crashed
 
 
 def copies_to_come(settings: HuntSettings) -> list[str] | None:

@@ -67,15 +67,10 @@ BarVerdict = Literal["below", "above", "undecided"]
 
 
 class Interval(NamedTuple):
-    """The rates that are compatible with the counted units.
+    """The rates that are compatible with the counted units."""
 
-    Args:
-        low: the least rate.
-        high: the greatest rate; infinite if there is no exposure.
-    """
-
-    low: float
-    high: float
+    low: float  # the least rate
+    high: float  # the greatest rate; infinite if there is no exposure
 
     def as_difference(self) -> str:
         """Return the interval of a difference as text.

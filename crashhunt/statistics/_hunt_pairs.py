@@ -42,19 +42,12 @@ _NEW_SQL = "number >= ? AND (ended_at >= ? OR outcome != 'invalid' OR instr(resu
 
 @dataclass(frozen=True, slots=True)
 class GateCase:
-    """The result of running one case of the corpus with the code of the version HEAD.
+    """The result of running one case of the corpus with the code of the version HEAD."""
 
-    Args:
-        name: name of the case's folder.
-        expected: the expected status: ``still`` or ``fixed``.
-        got: the status with HEAD: ``still``, ``fixed``, ``changed`` or ``cannot_run``.
-        now: description of the present result.
-    """
-
-    name: str
-    expected: str
-    got: str
-    now: str
+    name: str  # name of the case's folder
+    expected: str  # the expected status: ``still`` or ``fixed``
+    got: str  # the status with HEAD: ``still``, ``fixed``, ``changed`` or ``cannot_run``
+    now: str  # description of the present result
 
     @property
     def has_come_back(self) -> bool:
@@ -64,26 +57,17 @@ class GateCase:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioCounts:
-    """The numbers of trial pairs in one hunt that both BASE and HEAD run.
+    """The numbers of trial pairs in one hunt that both BASE and HEAD run."""
 
-    Args:
-        name: name of the hunt: its id and run in the suite, or the name of the scenario.
-        pairs: number of pairs on which the verdict is based.
-        only_base: number of the pairs in which only BASE crashes or does not start.
-        only_head: number of pairs in which only HEAD crashes or does not start.
-        both: number of pairs in which both fail.
-        invalid: number of pairs whose trials are invalid for both versions; they do not count.
-        sides: the trials of BASE and of HEAD that are invalid in one version only.
-        types: for each crash type, the number of crashes of BASE and of HEAD in the pairs.
-    """
-
-    name: str
-    pairs: int
-    only_base: int
-    only_head: int
-    both: int
-    invalid: int = 0
+    name: str  # name of the hunt: its id and run in the suite, or the name of the scenario
+    pairs: int  # number of pairs on which the verdict is based
+    only_base: int  # number of the pairs in which only BASE crashes or does not start
+    only_head: int  # number of pairs in which only HEAD crashes or does not start
+    both: int  # number of pairs in which both fail
+    invalid: int = 0  # number of pairs whose trials are invalid for both versions; they do not count
+    # the trials of BASE and of HEAD that are invalid in one version only
     sides: tuple[SideCounts, SideCounts] = (SideCounts(), SideCounts())
+    # for each crash type, the number of crashes of BASE and of HEAD in the pairs
     types: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def to_json(self) -> JsonObject:
@@ -105,55 +89,35 @@ def _uncounted(invalid: int, sides: tuple[SideCounts, SideCounts]) -> JsonObject
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateReport:
-    """The report of a gate.
+    """The report of a gate."""
 
-    Args:
-        verdict: verdict on HEAD, compared with BASE: ``better``, ``worse``, ``no_difference`` or ``undecided``.
-        base: the version BASE: a commit or an agent.
-        head: the version HEAD: a commit or an agent.
-        pairs: number of pairs on which the verdict is based.
-        only_base: number of the pairs in which only BASE crashes or does not start.
-        only_head: number of pairs in which only HEAD crashes or does not start.
-        both: number of pairs in which both versions fail.
-        evidence: e-value against the hypothesis that both versions crash equally often.
-        difference: interval of the difference in failures per trial, HEAD minus BASE, from which the verdict follows;
-            None without a pair.
-        margin: the greatest difference that counts as no difference; 0 to disable this verdict.
-        confidence: confidence in percent, of the verdict and of the interval.
-        seed: seed of the hunts.
-        scenarios: the counts of pairs for each hunt.
-        rates: crash rates of BASE and of HEAD, if each has only one hunt, and it has begun.
-        corpus: the cases that were run; None if there is no corpus.
-        why: reason why the verdict differs from the verdict of the pairs, or why there is no verdict; empty if neither
-            applies.
-        is_interrupted: whether the gate was interrupted before its end.
-        dir: directory of the hunts; empty if they are not kept.
-        trained_on: number of pairs that do not count, because an agent was trained on their traffic.
-        cautions: facts because of which the verdict may not be about the two versions.
-        preventable: numbers of crashes of both versions, if only preventable crashes count: ``yes``, ``no`` and
-            ``unknown`` for collisions, and ``no_collision``; None if all crashes count.
-    """
-
+    # verdict on HEAD, compared with BASE: ``better``, ``worse``, ``no_difference`` or ``undecided``
     verdict: PairVerdict
-    base: str
-    head: str
-    pairs: int = 0
-    only_base: int = 0
-    only_head: int = 0
-    both: int = 0
-    evidence: float = 1.0
+    base: str  # the version BASE: a commit or an agent
+    head: str  # the version HEAD: a commit or an agent
+    pairs: int = 0  # number of pairs on which the verdict is based
+    only_base: int = 0  # number of the pairs in which only BASE crashes or does not start
+    only_head: int = 0  # number of pairs in which only HEAD crashes or does not start
+    both: int = 0  # number of pairs in which both versions fail
+    evidence: float = 1.0  # e-value against the hypothesis that both versions crash equally often
+    # interval of the difference in failures per trial, HEAD minus BASE, from which the verdict follows; None without a
+    # pair
     difference: Interval | None = None
-    margin: float = 0.0
-    confidence: float = 95.0
-    seed: int | None = None
-    scenarios: tuple[ScenarioCounts, ...] = ()
+    margin: float = 0.0  # the greatest difference that counts as no difference; 0 to disable this verdict
+    confidence: float = 95.0  # confidence in percent, of the verdict and of the interval
+    seed: int | None = None  # seed of the hunts
+    scenarios: tuple[ScenarioCounts, ...] = ()  # the counts of pairs for each hunt
+    # crash rates of BASE and of HEAD, if each has only one hunt, and it has begun
     rates: tuple[CrashRate, CrashRate] | None = None
-    corpus: tuple[GateCase, ...] | None = None
+    corpus: tuple[GateCase, ...] | None = None  # the cases that were run; None if there is no corpus
+    # reason why the verdict differs from the verdict of the pairs, or why there is no verdict; empty if neither applies
     why: str = ""
-    is_interrupted: bool = False
-    dir: str = ""
-    trained_on: int = 0
-    cautions: tuple[str, ...] = ()
+    is_interrupted: bool = False  # whether the gate was interrupted before its end
+    dir: str = ""  # directory of the hunts; empty if they are not kept
+    trained_on: int = 0  # number of pairs that do not count, because an agent was trained on their traffic
+    cautions: tuple[str, ...] = ()  # facts because of which the verdict may not be about the two versions
+    # numbers of crashes of both versions, if only preventable crashes count: ``yes``, ``no`` and ``unknown`` for
+    # collisions, and ``no_collision``; None if all crashes count
     preventable: Mapping[str, int] | None = None
 
     @property

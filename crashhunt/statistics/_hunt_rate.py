@@ -198,20 +198,13 @@ def _why_no_estimate(settings: HuntSettings, facts: Facts, sequence: UnitSequenc
 
 @dataclass(frozen=True, slots=True)
 class _Division:
-    """A division of a rate into parts.
+    """A division of a rate into parts."""
 
-    Args:
-        by: the dividing property, as text.
-        tag: function that returns the name of the part to which a trial or its crash belongs, from the ledger's JSON
-            data.
-        of_crashes: whether crashes are divided instead of trials.
-        names: names of the parts; empty if the crashes determine the parts.
-    """
-
-    by: str
+    by: str  # the dividing property, as text
+    # function that returns the name of the part to which a trial or its crash belongs, from the ledger's JSON data
     tag: Callable[[JsonObject], str]
-    of_crashes: bool
-    names: tuple[str, ...] = ()
+    of_crashes: bool  # whether crashes are divided instead of trials
+    names: tuple[str, ...] = ()  # names of the parts; empty if the crashes determine the parts
 
 
 def _division(by: str, hunt: HuntResults, settings: HuntSettings, facts: Facts) -> _Division:

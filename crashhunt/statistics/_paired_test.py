@@ -165,19 +165,12 @@ class PairSequence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SideCounts:
-    """The trials of one agent that are invalid, although the same trials of the other agent are not.
+    """The trials of one agent that are invalid, although the same trials of the other agent are not."""
 
-    Args:
-        not_started: number of trials that count as failures, because the user's code prevented their start.
-        killed: number of trials whose processes were killed from outside.
-        unknown: number of trials that are invalid for any other reason.
-        example: number of one of these trials, and the reason why it is invalid; empty if there is none.
-    """
-
-    not_started: int = 0
-    killed: int = 0
-    unknown: int = 0
-    example: str = ""
+    not_started: int = 0  # number of trials that count as failures, because the user's code prevented their start
+    killed: int = 0  # number of trials whose processes were killed from outside
+    unknown: int = 0  # number of trials that are invalid for any other reason
+    example: str = ""  # number of one of these trials, and the reason why it is invalid; empty if there is none
 
     @property
     def lost(self) -> int:

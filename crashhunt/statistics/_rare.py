@@ -88,41 +88,24 @@ MAX_EXCLUDED: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """The estimates from one root, which is a trial from which copies were forked.
+    """The estimates from one root, which is a trial from which copies were forked."""
 
-    Args:
-        undisturbed: estimate of the probability of a crash on which no disturbance had an effect.
-        disturbed: estimate of the probability of all other crashes.
-        counted: the part of ``undisturbed`` that is a share of trials and contains no copies.
-        own: the part of the sum of both estimates that comes from the root itself, from 0 to 1.
-        by: the part of ``disturbed`` that comes from copies, by cell (a model of disturbances with one strength).
-        steps: number of simulated steps of the root and its copies.
-        own_steps: number of simulated steps of the root itself.
-        bound: upper bound of the part that comes from copies, known before the root begins.
-        crashed: whether the root itself crashed undisturbed.
-        copies: the part of the estimates that comes from copies, from 0 to `bound`.
-        plain: number of valid plain trials after the root.
-        invalid: number of invalid plain trials after the root, which do not count.
-        plain_crashes: number of valid plain trials after the root that crashed.
-        plain_undisturbed: number of valid plain trials after the root that crashed undisturbed.
-        plain_steps: number of simulated steps of the valid plain trials after the root.
-    """
-
-    undisturbed: float
-    disturbed: float
-    counted: float = 0.0
-    own: float = 0.0
+    undisturbed: float  # estimate of the probability of a crash on which no disturbance had an effect
+    disturbed: float  # estimate of the probability of all other crashes
+    counted: float = 0.0  # the part of ``undisturbed`` that is a share of trials and contains no copies
+    own: float = 0.0  # the part of the sum of both estimates that comes from the root itself, from 0 to 1
+    # the part of ``disturbed`` that comes from copies, by cell (a model of disturbances with one strength)
     by: Mapping[str, float] = field(default_factory=dict)
-    steps: int = 0
-    own_steps: int = 0
-    bound: float = math.inf
-    crashed: bool = False
-    copies: float = 0.0
-    plain: int = 0
-    invalid: int = 0
-    plain_crashes: int = 0
-    plain_undisturbed: int = 0
-    plain_steps: int = 0
+    steps: int = 0  # number of simulated steps of the root and its copies
+    own_steps: int = 0  # number of simulated steps of the root itself
+    bound: float = math.inf  # upper bound of the part that comes from copies, known before the root begins
+    crashed: bool = False  # whether the root itself crashed undisturbed
+    copies: float = 0.0  # the part of the estimates that comes from copies, from 0 to `bound`
+    plain: int = 0  # number of valid plain trials after the root
+    invalid: int = 0  # number of invalid plain trials after the root, which do not count
+    plain_crashes: int = 0  # number of valid plain trials after the root that crashed
+    plain_undisturbed: int = 0  # number of valid plain trials after the root that crashed undisturbed
+    plain_steps: int = 0  # number of simulated steps of the valid plain trials after the root
 
     @property
     def value(self) -> float:
@@ -132,69 +115,42 @@ class Root:
 
 @dataclass(frozen=True, slots=True)
 class Estimated(Serializable):
-    """An estimated interval, and the figures that show its reliability.
+    """An estimated interval, and the figures that show its reliability."""
 
-    Args:
-        low: lower end of the interval.
-        high: upper end of the interval.
-        effective: effective sample size of the weighted part of the estimate, as a number of roots.
-        largest_share: share of the root with the greatest value in the sum of the weighted part, 0 to 1.
-        roots_with_crash: number of roots with a value above 0 in the weighted part.
-    """
-
-    low: float
-    high: float
-    effective: float
-    largest_share: float
-    roots_with_crash: int
+    low: float  # lower end of the interval
+    high: float  # upper end of the interval
+    effective: float  # effective sample size of the weighted part of the estimate, as a number of roots
+    largest_share: float  # share of the root with the greatest value in the sum of the weighted part, 0 to 1
+    roots_with_crash: int  # number of roots with a value above 0 in the weighted part
 
 
 @dataclass(frozen=True, slots=True)
 class RareEstimate:
-    """The crash probability per trial, estimated from roots and their copies.
+    """The crash probability per trial, estimated from roots and their copies."""
 
-    Args:
-        roots: number of roots.
-        estimate: estimated crash probability per trial, from 0 to 1; None if there is no root.
-        undisturbed: the part of the estimate from crashes on which no disturbance had an effect.
-        disturbed: the part of the estimate from all other crashes.
-        estimated: interval of ``estimate``; None if the roots do not allow an interval.
-        estimated_disturbed: interval of ``disturbed``; None if the roots do not allow an interval.
-        why_not: reason why ``estimate`` has no interval; empty if it has an interval.
-        why_not_disturbed: reason why ``disturbed`` has no interval; empty if it has an interval.
-        more_roots: number of further roots that ``estimated`` probably needs; None if that cannot be predicted.
-        certain: interval that is valid even for crashes that no copy has met; None if it was not requested.
-        excluded: number of roots without a complete result.
-        parts: the part of ``disturbed`` for each cell, to which the first disturbance belongs.
-        undisturbed_crashes: number of roots and plain trials that crashed undisturbed.
-        plain: number of plain trials that count.
-        plain_crashes: number of plain trials that crashed.
-        steps: number of simulated steps.
-        plain_steps: number of simulated steps of plain trials.
-        plain_equivalent_steps: number of steps that plain trials would need for the same standard error. None if there
-            is no standard error, or if the estimate is 1.
-        confidence: confidence of all intervals, in (0, 1).
-    """
-
-    roots: int
-    estimate: float | None
-    undisturbed: float
-    disturbed: float
-    estimated: Estimated | None
-    estimated_disturbed: Estimated | None
-    why_not: str
-    why_not_disturbed: str
+    roots: int  # number of roots
+    estimate: float | None  # estimated crash probability per trial, from 0 to 1; None if there is no root
+    undisturbed: float  # the part of the estimate from crashes on which no disturbance had an effect
+    disturbed: float  # the part of the estimate from all other crashes
+    estimated: Estimated | None  # interval of ``estimate``; None if the roots do not allow an interval
+    estimated_disturbed: Estimated | None  # interval of ``disturbed``; None if the roots do not allow an interval
+    why_not: str  # reason why ``estimate`` has no interval; empty if it has an interval
+    why_not_disturbed: str  # reason why ``disturbed`` has no interval; empty if it has an interval
+    # number of further roots that ``estimated`` probably needs; None if that cannot be predicted
     more_roots: int | None
+    # interval that is valid even for crashes that no copy has met; None if it was not requested
     certain: tuple[float, float] | None
-    excluded: int
-    parts: Mapping[str, float]
-    undisturbed_crashes: int
-    plain: int
-    plain_crashes: int
-    steps: int
-    plain_steps: int
+    excluded: int  # number of roots without a complete result
+    parts: Mapping[str, float]  # the part of ``disturbed`` for each cell, to which the first disturbance belongs
+    undisturbed_crashes: int  # number of roots and plain trials that crashed undisturbed
+    plain: int  # number of plain trials that count
+    plain_crashes: int  # number of plain trials that crashed
+    steps: int  # number of simulated steps
+    plain_steps: int  # number of simulated steps of plain trials
+    # number of steps that plain trials would need for the same standard error. None if there is no standard error, or
+    # if the estimate is 1.
     plain_equivalent_steps: float | None
-    confidence: float
+    confidence: float  # confidence of all intervals, in (0, 1)
 
     @property
     def relative_error(self) -> float:

@@ -16,22 +16,14 @@ _MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six dig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RatePart(Serializable):
-    """The rate of a part of the crashes, or in a part of the trials.
+    """The rate of a part of the crashes, or in a part of the trials."""
 
-    Args:
-        by: the property that divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument.
-        name: name of the part, such as a crash type or a range of the argument.
-        trials: number of valid trials in the part.
-        crashes: number of crashes in the part.
-        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
-        certain: interval that is valid at any time, at the confidence of all parts together; None if there is none.
-    """
-
-    by: str
-    name: str
-    trials: int
-    crashes: int
-    estimate: float | None
+    by: str  # the property that divides the parts: ``kind``, ``fault``, ``disturbance`` or an argument
+    name: str  # name of the part, such as a crash type or a range of the argument
+    trials: int  # number of valid trials in the part
+    crashes: int  # number of crashes in the part
+    estimate: float | None  # crashes divided by exposure; None if the number of trials was not fixed in advance
+    # interval that is valid at any time, at the confidence of all parts together; None if there is none
     certain: Interval | None
 
 
@@ -46,46 +38,28 @@ class Exposure(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrashRate(Serializable):
-    """The crash rate of the agents of a hunt.
+    """The crash rate of the agents of a hunt."""
 
-    Args:
-        dir: directory of the hunt.
-        per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
-        confidence: confidence, in percent, of the certain interval, which is valid after any number of trials.
-        method: either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances.
-        units: number of independent units that count: trials or traffic seeds.
-        crashes: number of crashes in the units that ``units`` counts.
-        trials: number of valid trials in the units that ``units`` counts.
-        driven_s: time that the agents drove in the counted trials, in s.
-        driven_m: distance that the agents drove in the counted trials, in m.
-        estimate: crashes divided by exposure; None if the number of trials was not fixed in advance.
-        certain: interval that is valid whenever the user looks at it; None if there is none.
-        why_not: reason why the interval or the estimate is missing; empty if both are given.
-        excluded: number of trials that do not count, by reason.
-        parts: parts of the rate, by disturbance and by the property that the user chose.
-        steps: number of simulated steps of the trials.
-        bar: threshold with which the rate is compared; None for no threshold.
-        verdict: either ``below``, ``above`` or ``undecided``; empty if there is no threshold.
-        why_undecided: reason why more trials cannot decide the comparison; empty if they can, or if it is decided.
-    """
-
-    dir: str
-    per: Per
-    confidence: float
+    dir: str  # directory of the hunt
+    per: Per  # the unit of exposure to which the rate refers, such as a trial or a kilometre
+    confidence: float  # confidence, in percent, of the certain interval, which is valid after any number of trials
+    # either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances
     method: Literal["plain", "rare"] = "plain"
-    units: int
-    crashes: int
-    trials: int
-    driven_s: float
-    driven_m: float
-    estimate: float | None
-    certain: Interval | None
-    why_not: str
-    excluded: dict[str, int]
-    parts: tuple[RatePart, ...] = ()
-    steps: int = 0
-    bar: float | None = None
+    units: int  # number of independent units that count: trials or traffic seeds
+    crashes: int  # number of crashes in the units that ``units`` counts
+    trials: int  # number of valid trials in the units that ``units`` counts
+    driven_s: float  # time that the agents drove in the counted trials, in s
+    driven_m: float  # distance that the agents drove in the counted trials, in m
+    estimate: float | None  # crashes divided by exposure; None if the number of trials was not fixed in advance
+    certain: Interval | None  # interval that is valid whenever the user looks at it; None if there is none
+    why_not: str  # reason why the interval or the estimate is missing; empty if both are given
+    excluded: dict[str, int]  # number of trials that do not count, by reason
+    parts: tuple[RatePart, ...] = ()  # parts of the rate, by disturbance and by the property that the user chose
+    steps: int = 0  # number of simulated steps of the trials
+    bar: float | None = None  # threshold with which the rate is compared; None for no threshold
+    # either ``below``, ``above`` or ``undecided``; empty if there is no threshold
     verdict: BarVerdict | Literal[""] = ""
+    # reason why more trials cannot decide the comparison; empty if they can, or if it is decided
     why_undecided: str = ""
 
     json_keys = (

@@ -43,35 +43,23 @@ _SPARE_STEPS = 1  # of the bound: exposures are rounded
 
 
 class TrialFacts(NamedTuple):
-    """The facts about a trial that a rate needs.
+    """The facts about a trial that a rate needs."""
 
-    Args:
-        number: number of the trial in the hunt.
-        has_ended: whether the trial has ended; False if its process was killed from outside, so that a resumed hunt
-            runs the trial again.
-        valid: whether the trial could be set up.
-        crashed: whether the trial ended with an outcome that the hunt counts as a crash.
-        steps: number of steps of the trial.
-        driven_s: time that the agents drove, in s; None if it is unknown.
-        driven_m: distance that the agents drove, in m; None if it is unknown.
-        step_length_s: step length of the simulator, in s; None if it is unknown.
-        origin: the strategy that proposed the trial; empty if there was none.
-        tags: the groups to which the trial belongs, such as the bin of an argument; used for parts of a rate.
-        seed: seed of the trial's traffic.
-        failure: the reason why the trial is invalid, where a ledger was read; None if the trial is valid.
-    """
-
-    number: int
+    number: int  # number of the trial in the hunt
+    # whether the trial has ended; False if its process was killed from outside, so that a resumed hunt runs the trial
+    # again
     has_ended: bool
-    valid: bool
-    crashed: bool
-    steps: int = 0
-    driven_s: float | None = None
-    driven_m: float | None = None
-    step_length_s: float | None = None
-    origin: str = ""
+    valid: bool  # whether the trial could be set up
+    crashed: bool  # whether the trial ended with an outcome that the hunt counts as a crash
+    steps: int = 0  # number of steps of the trial
+    driven_s: float | None = None  # time that the agents drove, in s; None if it is unknown
+    driven_m: float | None = None  # distance that the agents drove, in m; None if it is unknown
+    step_length_s: float | None = None  # step length of the simulator, in s; None if it is unknown
+    origin: str = ""  # the strategy that proposed the trial; empty if there was none
+    # the groups to which the trial belongs, such as the bin of an argument; used for parts of a rate
     tags: tuple[str, ...] = ()
-    seed: int = 0
+    seed: int = 0  # seed of the trial's traffic
+    # the reason why the trial is invalid, where a ledger was read; None if the trial is valid
     failure: Failure | None = None
 
 
@@ -116,27 +104,17 @@ def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CountingRule:
-    """The rule by which trials count, fixed before the first trial.
+    """The rule by which trials count, fixed before the first trial."""
 
-    Args:
-        max_steps: maximum number of steps of a trial.
-        agents: number of controlled vehicles.
-        plain_origin: the origin of the trials that were drawn independently; empty if all trials were drawn
-            independently.
-        traffics: number of traffic seeds of the hunt; 0 if each trial has its own seed.
-        planned: planned number of trials; 0 for no limit.
-        is_held_out: function that returns whether no agent was trained on the traffic of a seed; None if no agent was
-            trained.
-        first: number of the first trial that counts; trials of lower numbers may have run with other code.
-    """
-
-    max_steps: int
-    agents: int = 1
+    max_steps: int  # maximum number of steps of a trial
+    agents: int = 1  # number of controlled vehicles
+    # the origin of the trials that were drawn independently; empty if all trials were drawn independently
     plain_origin: str = ""
-    traffics: int = 0
-    planned: int = 0
+    traffics: int = 0  # number of traffic seeds of the hunt; 0 if each trial has its own seed
+    planned: int = 0  # planned number of trials; 0 for no limit
+    # function that returns whether no agent was trained on the traffic of a seed; None if no agent was trained
     is_held_out: Callable[[int], bool] | None = None
-    first: int = 0
+    first: int = 0  # number of the first trial that counts; trials of lower numbers may have run with other code
 
     @property
     def trials_per_unit(self) -> int:

@@ -61,68 +61,43 @@ _MIN_SLOTS = 2  # trials at a time: BASE and HEAD run side by side
 
 @dataclass(frozen=True, slots=True)
 class GateProgress:
-    """Progress of a running gate, for display.
+    """Progress of a running gate, for display."""
 
-    Args:
-        name: name of the running hunt.
-        done: number of finished pairs of trials in all hunts.
-        most: maximum number of pairs.
-        only_base: number of pairs in which only BASE crashes.
-        only_head: number of pairs in which only HEAD crashes.
-        evidence: e-value against the hypothesis that both versions crash equally often.
-    """
-
-    name: str
-    done: int
-    most: int
-    only_base: int
-    only_head: int
-    evidence: float
+    name: str  # name of the running hunt
+    done: int  # number of finished pairs of trials in all hunts
+    most: int  # maximum number of pairs
+    only_base: int  # number of pairs in which only BASE crashes
+    only_head: int  # number of pairs in which only HEAD crashes
+    evidence: float  # e-value against the hypothesis that both versions crash equally often
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """The two versions that a gate compares, and the limits of the comparison.
+    """The two versions that a gate compares, and the limits of the comparison."""
 
-    Args:
-        base: the version before the change.
-        head: the version that contains the change.
-        hunts: name and request of each hunt that both versions run; the ``trials`` of a request are ignored.
-        folder: folder from which the user imports agents.
-        most: maximum number of pairs of trials in all hunts together.
-        duration_s: maximum wall time, in s; infinite for no limit.
-        margin: the greatest difference in crashes per trial that counts as equivalent; 0 to disable the verdict of
-            equivalence.
-        confidence: confidence of the verdict, in percent.
-        corpus: path of HEAD's corpus, relative to the folder. If it is None, ``crashes`` is used if HEAD is a commit
-            that contains it.
-        parallel: number of trials at a time, of both versions together; 0 for one per core.
-        is_suite: whether there may be several hunts; in that case, only the verdict *worse* ends the gate before the
-            last hunt.
-        trusted: whether existing hunts and the corpus may run even if they are not trusted.
-        machine: execution options, such as ``executor``, that apply to all hunts.
-        only_preventable: whether a collision counts only if a model of a competent driver would have prevented it.
-            Crashes without a collision partner always count.
-        build: command line that builds each commit in its work tree; empty for no build.
-        build_limit_s: maximum wall time of a build, in s.
-    """
-
-    base: GateVersion
-    head: GateVersion
+    base: GateVersion  # the version before the change
+    head: GateVersion  # the version that contains the change
+    # name and request of each hunt that both versions run; the ``trials`` of a request are ignored
     hunts: Mapping[str, RunRequest]
-    folder: Path
-    most: int
-    duration_s: float = math.inf
+    folder: Path  # folder from which the user imports agents
+    most: int  # maximum number of pairs of trials in all hunts together
+    duration_s: float = math.inf  # maximum wall time, in s; infinite for no limit
+    # the greatest difference in crashes per trial that counts as equivalent; 0 to disable the verdict of equivalence
     margin: float = 0.0
-    confidence: float = 95.0
+    confidence: float = 95.0  # confidence of the verdict, in percent
+    # path of HEAD's corpus, relative to the folder. If it is None, ``crashes`` is used if HEAD is a commit that
+    # contains it.
     corpus: Path | None = None
-    parallel: int = 0
+    parallel: int = 0  # number of trials at a time, of both versions together; 0 for one per core
+    # whether there may be several hunts; in that case, only the verdict *worse* ends the gate before the last hunt
     is_suite: bool = False
-    trusted: bool = False
-    machine: Given | None = None
+    trusted: bool = False  # whether existing hunts and the corpus may run even if they are not trusted
+    machine: Given | None = None  # execution options, such as ``executor``, that apply to all hunts
+    # whether a collision counts only if a model of a competent driver would have prevented it. Crashes without a
+    # collision partner always count.
     only_preventable: bool = False
-    build: str = ""
-    build_limit_s: float = math.inf
+    build: str = ""  # command line that builds each commit in its work tree; empty for no build
+    build_limit_s: float = math.inf  # maximum wall time of a build, in s
 
     def run(
         self,

@@ -34,17 +34,12 @@ _ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys
 
 @dataclass(frozen=True, slots=True)
 class GateVersion:
-    """One of the two versions that a gate compares: BASE or HEAD.
+    """One of the two versions that a gate compares: BASE or HEAD."""
 
-    Args:
-        word: the version as the user named it.
-        agents: target of the agent of each vehicle, as in ``--agent``; empty if the version is a commit.
-        commit: hexadecimal digits of the commit; empty if the version is an agent.
-    """
-
-    word: str
+    word: str  # the version as the user named it
+    # target of the agent of each vehicle, as in ``--agent``; empty if the version is a commit
     agents: Mapping[str, str]
-    commit: str = ""
+    commit: str = ""  # hexadecimal digits of the commit; empty if the version is an agent
 
     @classmethod
     def of(cls, word: str, folder: Path) -> GateVersion:

@@ -28,15 +28,10 @@ _PURPOSE = "request of a suite"  # of its authentication code
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """The request for one run of a suite, stored as `request.json` in the folder of the run.
+    """The request for one run of a suite, stored as `request.json` in the folder of the run."""
 
-    Args:
-        request: request of the hunt.
-        folder: folder from which agents are imported.
-    """
-
-    request: Request
-    folder: str
+    request: Request  # request of the hunt
+    folder: str  # folder from which agents are imported
 
     def to_json(self) -> dict[str, object]:
         """Return JSON-compatible data: the options that determine trials, those of the run, those of the snapshot."""

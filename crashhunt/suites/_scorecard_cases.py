@@ -49,27 +49,16 @@ _SPEEDS_KMH = (1, 250)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """A group of cases of a regulation.
+    """A group of cases of a regulation."""
 
-    Args:
-        id: name of the group.
-        paragraph: where the regulation describes it.
-        x: the argument along the horizontal axis of the maps.
-        y: the argument along the vertical axis of the maps.
-        axes: the values of these and further arguments, in the notation of ``--set``.
-        constants: values of further arguments.
-        models: the models that apply.
-        why_not: why the other models do not apply.
-    """
-
-    id: str
-    paragraph: str
-    x: str
-    y: str
-    axes: Mapping[str, str]
-    constants: Mapping[str, str]
-    models: tuple[str, ...] = _WITHOUT_CUT_IN
-    why_not: str = _NO_CUT_IN
+    id: str  # name of the group
+    paragraph: str  # where the regulation describes it
+    x: str  # the argument along the horizontal axis of the maps
+    y: str  # the argument along the vertical axis of the maps
+    axes: Mapping[str, str]  # the values of these and further arguments, in the notation of ``--set``
+    constants: Mapping[str, str]  # values of further arguments
+    models: tuple[str, ...] = _WITHOUT_CUT_IN  # the models that apply
+    why_not: str = _NO_CUT_IN  # why the other models do not apply
 
     @property
     def scenario(self) -> str:
@@ -252,31 +241,18 @@ class Share:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScorecardHunt:
-    """The cases of one hunt: which ran, how they ended, and how the models end.
+    """The cases of one hunt: which ran, how they ended, and how the models end."""
 
-    Args:
-        group: the group of the cases.
-        state: state of the hunt.
-        axes: the values of each argument that varies, in the order of the names.
-        constants: the other arguments of the scenario.
-        ran: for each case that ran, whether the agent crashed, by the index of the case.
-        random: the cases that were drawn at random.
-        invalid: number of cases that could not be set up.
-        drivers: whether each model crashes, by case; models that do not apply are missing.
-        facts: seed, digests and versions.
-        units: unit of each argument; a missing unit is empty.
-    """
-
-    group: Group
-    state: HuntState
-    axes: Mapping[str, tuple[Value, ...]]
-    constants: Mapping[str, Value]
-    ran: Mapping[int, bool]
-    random: frozenset[int]
-    invalid: int
-    drivers: Mapping[str, Labels]
-    facts: JsonObject
-    units: Mapping[str, str] = field(default_factory=dict)
+    group: Group  # the group of the cases
+    state: HuntState  # state of the hunt
+    axes: Mapping[str, tuple[Value, ...]]  # the values of each argument that varies, in the order of the names
+    constants: Mapping[str, Value]  # the other arguments of the scenario
+    ran: Mapping[int, bool]  # for each case that ran, whether the agent crashed, by the index of the case
+    random: frozenset[int]  # the cases that were drawn at random
+    invalid: int  # number of cases that could not be set up
+    drivers: Mapping[str, Labels]  # whether each model crashes, by case; models that do not apply are missing
+    facts: JsonObject  # seed, digests and versions
+    units: Mapping[str, str] = field(default_factory=dict)  # unit of each argument; a missing unit is empty
 
     @property
     def shape(self) -> tuple[int, ...]:
