@@ -291,20 +291,13 @@ class DisturbanceSampler:
 
     In every step, each model begins a disturbance around each agent with a probability of rate times step length, even
     while other disturbances are active.
-
-    Args:
-        models: models by name.
-        rates: rate of each model, in 1/s, by name.
-        agents: the controlled vehicles, around which disturbances occur.
-        step_length_s: step length in s.
-        fixed: disturbances that every trial has in addition to the drawn ones.
     """
 
-    models: Mapping[str, DisturbanceModel]
-    rates: Mapping[str, float]
-    agents: tuple[str, ...]
-    step_length_s: float
-    fixed: tuple[Disturbance, ...] = ()
+    models: Mapping[str, DisturbanceModel]  # models by name
+    rates: Mapping[str, float]  # rate of each model, in 1/s, by name
+    agents: tuple[str, ...]  # the controlled vehicles, around which disturbances occur
+    step_length_s: float  # step length in s
+    fixed: tuple[Disturbance, ...] = ()  # disturbances that every trial has in addition to the drawn ones
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:
         """Return the disturbances of a trial in order; a longer trial with the same seed begins with the same ones."""

@@ -41,19 +41,13 @@ _WEIGHT_BY_PLACE = {"left": 1.0, "right": 1.0, "left ahead": 2.0, "right ahead":
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """A model that draws place, strength and duration independently of each other.
+    """A model that draws place, strength and duration independently of each other."""
 
-    Args:
-        what: kind of the disturbance, such as ``brake``.
-        who: the possible places of the disturbed actor, relative to the agent, such as ``ahead``, each with its weight.
-        how_strong: possible strengths with their weights, in the unit of the kind.
-        how_long: possible durations with their weights, in s.
-    """
-
-    what: str
+    what: str  # kind of the disturbance, such as ``brake``
+    # the possible places of the disturbed actor, relative to the agent, such as ``ahead``, each with its weight
     who: Mapping[str, float]
-    how_strong: Mapping[float, float]
-    how_long: Mapping[float, float]
+    how_strong: Mapping[float, float]  # possible strengths with their weights, in the unit of the kind
+    how_long: Mapping[float, float]  # possible durations with their weights, in s
 
     def draw(self, rng: np.random.Generator) -> Drawn:
         """Draw place, strength and duration, in this order."""

@@ -75,25 +75,16 @@ _KIND_WITH_STRENGTH_TARGETS = (
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """The beginning of a first disturbance, which is forced on a copy of the root trial.
+    """The beginning of a first disturbance, which is forced on a copy of the root trial."""
 
-    Args:
-        cell: the model and strength, such as ``brake=4.0``.
-        weight: probability of all the disturbances that this forced disturbance represents.
-        step: the step in which the disturbance begins.
-        planned: the forced disturbance and all later disturbances of the copy, in order.
-        alone: only the forced disturbance, for a copy on which second disturbances are forced.
-        number: number of the forced disturbance in its root trial.
-        place: position of the model in the order in which models begin disturbances within a step.
-    """
-
-    cell: str
-    weight: float
-    step: int
-    planned: tuple[Disturbance, ...]
+    cell: str  # the model and strength, such as ``brake=4.0``
+    weight: float  # probability of all the disturbances that this forced disturbance represents
+    step: int  # the step in which the disturbance begins
+    planned: tuple[Disturbance, ...]  # the forced disturbance and all later disturbances of the copy, in order
+    # only the forced disturbance, for a copy on which second disturbances are forced
     alone: tuple[Disturbance, ...] = ()
-    number: int = 0
-    place: int = 0
+    number: int = 0  # number of the forced disturbance in its root trial
+    place: int = 0  # position of the model in the order in which models begin disturbances within a step
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,17 +13,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A disturbance that a model has drawn.
+    """A disturbance that a model has drawn."""
 
-    Args:
-        who: the place around the agent, one of `crashhunt.trial.CELLS`.
-        how_strong: strength of the disturbance, in the unit of the kind.
-        how_long: duration of the disturbance, in s.
-    """
-
-    who: str
-    how_strong: float
-    how_long: float
+    who: str  # the place around the agent, one of `crashhunt.trial.CELLS`
+    how_strong: float  # strength of the disturbance, in the unit of the kind
+    how_long: float  # duration of the disturbance, in s
 
 
 class DisturbanceModel(Protocol):

@@ -20,17 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ObservedPart(Serializable):
-    """A part of an observation that consists of several arrays, which are recorded as one array.
+    """A part of an observation that consists of several arrays, which are recorded as one array."""
 
-    Args:
-        name: name of the part.
-        shape: shape of the part.
-        columns: names of the entries of its last axis; empty if they have no names.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    columns: tuple[str, ...] = ()
+    name: str  # name of the part
+    shape: tuple[int, ...]  # shape of the part
+    columns: tuple[str, ...] = ()  # names of the entries of its last axis; empty if they have no names
 
     @property
     def size(self) -> int:
@@ -40,27 +34,16 @@ class ObservedPart(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class AgentChannel(Serializable):
-    """Types and shapes of the observations and actions of one agent.
+    """Types and shapes of the observations and actions of one agent."""
 
-    Args:
-        id: identifier of the agent, which is also the identifier of its vehicle.
-        observation_dtype: type of the observations in NumPy's notation, such as ``<f4``.
-        observation_shape: shape of one observation.
-        action_dtype: type of the actions in NumPy's notation, such as ``<i8``.
-        action_shape: shape of one action.
-        action_names: names of the elements of an action.
-        observation_names: names of the columns of an observation.
-        observation_parts: the parts of an observation, in their order in the recorded array; empty if the observation
-            has no parts.
-    """
-
-    id: str
-    observation_dtype: str
-    observation_shape: tuple[int, ...]
-    action_dtype: str
-    action_shape: tuple[int, ...]
-    action_names: tuple[str, ...] = ()
-    observation_names: tuple[str, ...] = ()
+    id: str  # identifier of the agent, which is also the identifier of its vehicle
+    observation_dtype: str  # type of the observations in NumPy's notation, such as ``<f4``
+    observation_shape: tuple[int, ...]  # shape of one observation
+    action_dtype: str  # type of the actions in NumPy's notation, such as ``<i8``
+    action_shape: tuple[int, ...]  # shape of one action
+    action_names: tuple[str, ...] = ()  # names of the elements of an action
+    observation_names: tuple[str, ...] = ()  # names of the columns of an observation
+    # the parts of an observation, in their order in the recorded array; empty if the observation has no parts
     observation_parts: tuple[ObservedPart, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
     def value_name(self, array: str, where: tuple[int, ...]) -> str:
@@ -109,16 +92,11 @@ class AgentChannel(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Prologue(Serializable):
-    """The agents and the step length of an episode.
+    """The agents and the step length of an episode."""
 
-    Args:
-        agents: agents in the order of their numbers.
-        step_length_s: step length in s of simulation time.
-        digest_of_changes: whether the digest covers only the changes of observations.
-    """
-
-    agents: tuple[AgentChannel, ...]
-    step_length_s: float
+    agents: tuple[AgentChannel, ...]  # agents in the order of their numbers
+    step_length_s: float  # step length in s of simulation time
+    # whether the digest covers only the changes of observations
     digest_of_changes: bool = field(default=False, metadata=OMIT_DEFAULT)
 
     def encode(self) -> bytes:
@@ -133,23 +111,15 @@ class Prologue(Serializable):
 
 @dataclass(slots=True)
 class StepRecord:
-    """The recorded data of one step.
+    """The recorded data of one step."""
 
-    Args:
-        step: number of the step; 0 is the start of the episode, before the first action.
-        scene: scene after the step; None if the process ended inside the step.
-        rewards: reward of each agent, by agent id.
-        observations: the observation of each agent before this step; empty at step 0.
-        actions: the action of each agent.
-        more: data of further record types, by the name of the type.
-    """
-
-    step: int
-    scene: Scene | None = None
-    rewards: dict[str, float] = field(default_factory=dict)
+    step: int  # number of the step; 0 is the start of the episode, before the first action
+    scene: Scene | None = None  # scene after the step; None if the process ended inside the step
+    rewards: dict[str, float] = field(default_factory=dict)  # reward of each agent, by agent id
+    # the observation of each agent before this step; empty at step 0
     observations: dict[str, NDArray[np.generic]] = field(default_factory=dict)
-    actions: dict[str, NDArray[np.generic]] = field(default_factory=dict)
-    more: dict[str, Any] = field(default_factory=dict)
+    actions: dict[str, NDArray[np.generic]] = field(default_factory=dict)  # the action of each agent
+    more: dict[str, Any] = field(default_factory=dict)  # data of further record types, by the name of the type
 
     @property
     def whole(self) -> bool:
@@ -170,25 +140,16 @@ class SceneParts(TypedDict, total=False):
 
 @dataclass(slots=True)
 class Reading:
-    """The part of an episode that has been read.
+    """The part of an episode that has been read."""
 
-    Args:
-        prologue: the agents and the step length of the episode.
-        actors: all actors that were introduced, in the order of their numbers.
-        steps: the complete steps since the beginning of the reading.
-        current: the step of which records are being read.
-        roster: the actors of the next scene.
-        scene: further arguments of the next scene, by their names; the next step uses them.
-        events: the traffic events of the next scene.
-    """
-
-    prologue: Prologue
-    actors: list[Actor] = field(default_factory=list)
-    steps: list[StepRecord] = field(default_factory=list)
-    current: StepRecord = field(default_factory=lambda: StepRecord(0))
-    roster: Roster = field(default_factory=lambda: Roster(()))
+    prologue: Prologue  # the agents and the step length of the episode
+    actors: list[Actor] = field(default_factory=list)  # all actors that were introduced, in the order of their numbers
+    steps: list[StepRecord] = field(default_factory=list)  # the complete steps since the beginning of the reading
+    current: StepRecord = field(default_factory=lambda: StepRecord(0))  # the step of which records are being read
+    roster: Roster = field(default_factory=lambda: Roster(()))  # the actors of the next scene
+    # further arguments of the next scene, by their names; the next step uses them
     scene: SceneParts = field(default_factory=SceneParts)
-    events: tuple[Event, ...] = ()
+    events: tuple[Event, ...] = ()  # the traffic events of the next scene
 
     def finish(self) -> None:
         """Add the step in which the process ended, if there is one."""

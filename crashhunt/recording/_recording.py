@@ -51,19 +51,12 @@ _MAX_CHUNKS = 4  # of a recording that takes more: a reader may follow a few pla
 
 
 class _Mark(NamedTuple):
-    """The place at which the records of a step begin.
+    """The place at which the records of a step begin."""
 
-    Args:
-        step: number of the step.
-        record: index of its first record.
-        roster: the actors of the scene before this record.
-        actors: number of actors that earlier records define.
-    """
-
-    step: int
-    record: int
-    roster: Roster
-    actors: int
+    step: int  # number of the step
+    record: int  # index of its first record
+    roster: Roster  # the actors of the scene before this record
+    actors: int  # number of actors that earlier records define
 
 
 class DecodedSteps(Sequence[StepRecord]):
@@ -323,19 +316,12 @@ def _stacked(found: list[NDArray[np.generic]], dtype: str, shape: tuple[int, ...
 
 @dataclass(frozen=True, slots=True)
 class Compact:
-    """A description of the parts that a compact recording lacks.
+    """A description of the parts that a compact recording lacks."""
 
-    Args:
-        digest: digest of the complete recording; empty if the recording is only a beginning.
-        actors: number of actors in the complete recording.
-        radius_m: maximum distance to an agent, in m, up to which an actor is recorded.
-        observations: whether the recording contains observations.
-    """
-
-    digest: str
-    actors: int
-    radius_m: float
-    observations: bool
+    digest: str  # digest of the complete recording; empty if the recording is only a beginning
+    actors: int  # number of actors in the complete recording
+    radius_m: float  # maximum distance to an agent, in m, up to which an actor is recorded
+    observations: bool  # whether the recording contains observations
 
 
 ActorSelector: TypeAlias = "Callable[[int, Sequence[str], NDArray[np.float64]], NDArray[np.bool_]]"
@@ -345,17 +331,11 @@ whether to keep each actor, shape (actors,)."""
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """Selects some given actors, and the actors near an agent.
+    """Selects some given actors, and the actors near an agent."""
 
-    Args:
-        agents: identifiers of the controlled vehicles.
-        always: identifiers of the actors that are kept in each step.
-        radius_m: maximum distance between the centres, in m.
-    """
-
-    agents: Collection[str]
-    always: Collection[str]
-    radius_m: float
+    agents: Collection[str]  # identifiers of the controlled vehicles
+    always: Collection[str]  # identifiers of the actors that are kept in each step
+    radius_m: float  # maximum distance between the centres, in m
 
     def __call__(self, step: int, actors: Sequence[str], points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether to keep each actor."""

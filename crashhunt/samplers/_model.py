@@ -133,17 +133,11 @@ _WIDEST = 1.0 / math.sqrt(12.0)  # standard deviation of a uniform draw, in widt
 
 
 class _Parameters(NamedTuple):
-    """What is fitted, each in steps from where the fit begins.
+    """What is fitted, each in steps from where the fit begins."""
 
-    Args:
-        lengths: doublings of the length scales; they begin at the root-mean-square distance of two uniform points.
-        noise: logarithm of the odds of the share of noise.
-        seeded: the same of the share that counts only with the same seed.
-    """
-
-    lengths: Floats
-    noise: float
-    seeded: float
+    lengths: Floats  # doublings of the length scales; they begin at the root-mean-square distance of two uniform points
+    noise: float  # logarithm of the odds of the share of noise
+    seeded: float  # the same of the share that counts only with the same seed
 
     @property
     def shares(self) -> tuple[float, float]:

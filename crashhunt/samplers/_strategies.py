@@ -35,19 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draft:
-    """A proposed point.
+    """A proposed point."""
 
-    Args:
-        point: point in the unit cube.
-        seed: seed of the trial; None for the seed that follows from the trial's number.
-        parent: the number of the trial that it is derived from; None if there is none.
-        origin: the strategy that proposes the point, if there are several strategies.
-    """
-
-    point: NDArray[np.float64]
-    seed: int | None = None
-    parent: int | None = None
-    origin: str = ""
+    point: NDArray[np.float64]  # point in the unit cube
+    seed: int | None = None  # seed of the trial; None for the seed that follows from the trial's number
+    parent: int | None = None  # the number of the trial that it is derived from; None if there is none
+    origin: str = ""  # the strategy that proposes the point, if there are several strategies
 
 
 class Strategy(Protocol):
@@ -77,44 +70,26 @@ _NUMBER_AT_END = re.compile(r"[\W_]*\d+\W*$")  # of a lane id: the lane's index 
 
 
 class Conjunct(NamedTuple):
-    """A conjunct of a requirement in a trial.
+    """A conjunct of a requirement in a trial."""
 
-    Args:
-        requirement: name of the requirement.
-        parts: robustness of its disjuncts; the conjunct is violated if all of them are negative.
-        slack_s: the time by which it holds, in s.
-    """
-
-    requirement: str
-    parts: tuple[float, ...]
-    slack_s: float = 0.0
+    requirement: str  # name of the requirement
+    parts: tuple[float, ...]  # robustness of its disjuncts; the conjunct is violated if all of them are negative
+    slack_s: float = 0.0  # the time by which it holds, in s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredTrial:
-    """A finished trial, as samplers learn from it.
+    """A finished trial, as samplers learn from it."""
 
-    Args:
-        number: number of the trial.
-        point: point of the trial in the unit cube.
-        seed: seed of the trial.
-        score: criticality from 0 to 1; `CRASHED` for a crash.
-        origin: the strategy that proposed the trial.
-        parent: number of the trial from which it was derived; None if there is none.
-        kind: type of the crash, as far as the result shows it; empty if it does not.
-        conjuncts: the conjuncts of the requirements of the hunt.
-        violated: name of the requirement that the trial violates; empty if there is none.
-    """
-
-    number: int
-    point: NDArray[np.float64]
-    seed: int
-    score: float
-    origin: str = ""
-    parent: int | None = None
-    kind: str = ""
-    conjuncts: tuple[Conjunct, ...] = ()
-    violated: str = ""
+    number: int  # number of the trial
+    point: NDArray[np.float64]  # point of the trial in the unit cube
+    seed: int  # seed of the trial
+    score: float  # criticality from 0 to 1; `CRASHED` for a crash
+    origin: str = ""  # the strategy that proposed the trial
+    parent: int | None = None  # number of the trial from which it was derived; None if there is none
+    kind: str = ""  # type of the crash, as far as the result shows it; empty if it does not
+    conjuncts: tuple[Conjunct, ...] = ()  # the conjuncts of the requirements of the hunt
+    violated: str = ""  # name of the requirement that the trial violates; empty if there is none
 
     @property
     def crashed(self) -> bool:

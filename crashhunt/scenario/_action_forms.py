@@ -23,23 +23,14 @@ _OLDER_NAMES = {FORMER_DEFAULT_ACTION: DEFAULT_ACTION}
 
 @dataclass(frozen=True, slots=True)
 class ActionComponent:
-    """One number of an action.
+    """One number of an action."""
 
-    Args:
-        name: name of the number.
-        low: smallest value.
-        high: largest value.
-        unit: unit of the number; empty for a choice.
-        help: meaning of the number in one line.
-        whole: whether only whole numbers are allowed.
-    """
-
-    name: str
-    low: float
-    high: float
-    unit: str = ""
-    help: str = ""
-    whole: bool = False
+    name: str  # name of the number
+    low: float  # smallest value
+    high: float  # largest value
+    unit: str = ""  # unit of the number; empty for a choice
+    help: str = ""  # meaning of the number in one line
+    whole: bool = False  # whether only whole numbers are allowed
 
     @property
     def range(self) -> str:
@@ -51,23 +42,14 @@ class ActionComponent:
 
 @dataclass(frozen=True, slots=True)
 class ActionSetting:
-    """A setting of a form of actions: a number within a range, or one of some words.
+    """A setting of a form of actions: a number within a range, or one of some words."""
 
-    Args:
-        name: name of the setting.
-        default: value without the setting.
-        help: meaning of the setting in one line.
-        high: largest value of a number; the smallest value is 0.
-        unit: unit of a number.
-        choices: the words, if the setting is no number.
-    """
-
-    name: str
-    default: float | str
-    help: str
-    high: float = 0.0
-    unit: str = ""
-    choices: tuple[str, ...] = ()
+    name: str  # name of the setting
+    default: float | str  # value without the setting
+    help: str  # meaning of the setting in one line
+    high: float = 0.0  # largest value of a number; the smallest value is 0
+    unit: str = ""  # unit of a number
+    choices: tuple[str, ...] = ()  # the words, if the setting is no number
 
     @property
     def range(self) -> str:
@@ -86,23 +68,14 @@ class ActionSetting:
 
 @dataclass(frozen=True, slots=True)
 class ActionDescription:
-    """One form of actions.
+    """One form of actions."""
 
-    Args:
-        title: what an agent returns and what the vehicle does, in one line.
-        components: the numbers of an action, in order.
-        shape: shape of an action; empty for a tuple of the components.
-        second_changes_lane: whether the second number moves the vehicle to another lane, and 0 does not.
-        moves_freely: whether the vehicle moves in the plane, and not along lanes.
-        settings: the settings of the form, as in ``trajectory:frame=ego``.
-    """
-
-    title: str
-    components: tuple[ActionComponent, ...]
-    shape: str = ""
-    second_changes_lane: bool = False
-    moves_freely: bool = False
-    settings: tuple[ActionSetting, ...] = ()
+    title: str  # what an agent returns and what the vehicle does, in one line
+    components: tuple[ActionComponent, ...]  # the numbers of an action, in order
+    shape: str = ""  # shape of an action; empty for a tuple of the components
+    second_changes_lane: bool = False  # whether the second number moves the vehicle to another lane, and 0 does not
+    moves_freely: bool = False  # whether the vehicle moves in the plane, and not along lanes
+    settings: tuple[ActionSetting, ...] = ()  # the settings of the form, as in ``trajectory:frame=ego``
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -465,15 +465,11 @@ class LoadOrder:
     """An order in which a simulator processes objects at load; crashhunt fixes this order if it can.
 
     If the order is not fixed, results depend on the memory addresses in a process.
-
-    Args:
-        what: description of the objects that are processed in this order.
-        keep: function that returns a scenario with the simulator's own order.
-        why_not: function that returns why the order is not fixed, as a text after "not fixed: "; empty if it is fixed.
     """
 
-    what: str
-    keep: Callable[[Scenario], Scenario]
+    what: str  # description of the objects that are processed in this order
+    keep: Callable[[Scenario], Scenario]  # function that returns a scenario with the simulator's own order
+    # function that returns why the order is not fixed, as a text after "not fixed: "; empty if it is fixed
     why_not: Callable[[Scenario], str]
 
 

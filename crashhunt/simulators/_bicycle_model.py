@@ -28,40 +28,24 @@ WHEELBASE_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class MotionState:
-    """The state of a vehicle that moves freely in the plane.
+    """The state of a vehicle that moves freely in the plane."""
 
-    Args:
-        x: position of the centre to the east, in m.
-        y: position of the centre to the north, in m.
-        heading: heading in rad, counter-clockwise from east.
-        speed: speed of the centre in m/s, at least 0.
-        acceleration: acceleration of the last step, in m/s².
-        steering: steering angle of the last step in rad, positive to the left.
-    """
-
-    x: float
-    y: float
-    heading: float
-    speed: float
-    acceleration: float = 0.0
-    steering: float = 0.0
+    x: float  # position of the centre to the east, in m
+    y: float  # position of the centre to the north, in m
+    heading: float  # heading in rad, counter-clockwise from east
+    speed: float  # speed of the centre in m/s, at least 0
+    acceleration: float = 0.0  # acceleration of the last step, in m/s²
+    steering: float = 0.0  # steering angle of the last step in rad, positive to the left
 
 
 @dataclass(frozen=True, slots=True)
 class BicycleModel:
-    """A vehicle that moves by the kinematic bicycle model, within its limits.
+    """A vehicle that moves by the kinematic bicycle model, within its limits."""
 
-    Args:
-        wheelbase: distance between the axles, in m.
-        max_acceleration: largest acceleration, in m/s².
-        max_deceleration: largest deceleration, in m/s².
-        max_speed: largest speed, in m/s.
-    """
-
-    wheelbase: float
-    max_acceleration: float
-    max_deceleration: float
-    max_speed: float = math.inf
+    wheelbase: float  # distance between the axles, in m
+    max_acceleration: float  # largest acceleration, in m/s²
+    max_deceleration: float  # largest deceleration, in m/s²
+    max_speed: float = math.inf  # largest speed, in m/s
 
     def step(self, state: MotionState, acceleration: float, steering: float, step_s: float) -> MotionState:
         """Return the state after a step; the vehicle stops at a standstill and does not drive backwards.

@@ -22,21 +22,13 @@ if TYPE_CHECKING:
 
 
 class Column(NamedTuple):
-    """A column of a part, which is an entry of the last axis.
+    """A column of a part, which is an entry of the last axis."""
 
-    Args:
-        name: Name of the column.
-        unit: Unit of the values; empty for numbers without a unit.
-        low: Lower bound of the values.
-        high: Upper bound of the values.
-        meaning: Description of the values.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    meaning: str
+    name: str  # name of the column
+    unit: str  # unit of the values; empty for numbers without a unit
+    low: float  # lower bound of the values
+    high: float  # upper bound of the values
+    meaning: str  # description of the values
 
     @property
     def range(self) -> str:
@@ -45,27 +37,17 @@ class Column(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """A setting of a part, such as its number of rows.
+    """A setting of a part, such as its number of rows."""
 
-    Args:
-        name: Name of the setting, as in ``actors:rows=8``.
-        default: The default value.
-        low: The smallest value.
-        high: The largest value.
-        unit: Unit of the value; empty for whole numbers.
-        meaning: Description of the setting.
-        choices: The words that the setting takes instead of numbers; its value is then the index of the word.
-        requires: The part that the simulator must also have for values other than 0; empty if there is none.
-    """
-
-    name: str
-    default: float
-    low: float
-    high: float
-    unit: str
-    meaning: str
+    name: str  # name of the setting, as in ``actors:rows=8``
+    default: float  # the default value
+    low: float  # the smallest value
+    high: float  # the largest value
+    unit: str  # unit of the value; empty for whole numbers
+    meaning: str  # description of the setting
+    # the words that the setting takes instead of numbers; its value is then the index of the word
     choices: tuple[str, ...] = ()
-    requires: str = ""
+    requires: str = ""  # the part that the simulator must also have for values other than 0; empty if there is none
 
     @property
     def is_whole(self) -> bool:
@@ -83,30 +65,21 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """A part of an observation.
+    """A part of an observation."""
 
-    Args:
-        name: Name of the part.
-        meaning: Description of the part.
-        axes: The axes before the columns, each a length or the name of the setting that contains it.
-        columns: The columns, which are the last axis; empty if the values of all axes have the same meaning.
-        values: Description of the values of a part without columns.
-        settings: The settings of the part.
-        measured: Columns that the disturbance ``noisy_observation`` changes; ``x`` and ``y`` relative to the position
-            of the controlled vehicle.
-        dtype: Data type of the values.
-        relation: The columns that the setting ``relation`` adds.
-    """
-
-    name: str
-    meaning: str
+    name: str  # name of the part
+    meaning: str  # description of the part
+    # the axes before the columns, each a length or the name of the setting that contains it
     axes: tuple[str | int, ...] = ()
+    # the columns, which are the last axis; empty if the values of all axes have the same meaning
     columns: tuple[Column, ...] = ()
-    values: Column | None = None
-    settings: tuple[Setting, ...] = ()
+    values: Column | None = None  # description of the values of a part without columns
+    settings: tuple[Setting, ...] = ()  # the settings of the part
+    # columns that the disturbance ``noisy_observation`` changes; ``x`` and ``y`` relative to the position of the
+    # controlled vehicle
     measured: tuple[str, ...] = ()
-    dtype: str = "<f8"
-    relation: tuple[Column, ...] = ()
+    dtype: str = "<f8"  # data type of the values
+    relation: tuple[Column, ...] = ()  # the columns that the setting ``relation`` adds
 
     @property
     def values_of_last_axis(self) -> tuple[Column, ...]:

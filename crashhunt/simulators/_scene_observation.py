@@ -40,17 +40,12 @@ _MAX_BEND = 2.0  # of the wheelbase times the curvature, with the front wheels a
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LanePlace:
-    """The place of an actor on the lanes.
+    """The place of an actor on the lanes."""
 
-    Args:
-        same_lane: Whether the actor is on the lane of the agent's vehicle, or on a lane before or after it.
-        offset: Distance of the front bumper's centre from the centre line of the lane, in m, positive to the left.
-        index: Index of the lane on its road, from 0 for the outer lane.
-    """
-
-    same_lane: bool = True
+    same_lane: bool = True  # whether the actor is on the lane of the agent's vehicle, or on a lane before or after it
+    # distance of the front bumper's centre from the centre line of the lane, in m, positive to the left
     offset: float = 0.0
-    index: int = 0
+    index: int = 0  # index of the lane on its road, from 0 for the outer lane
 
 
 class SceneObserver:

@@ -29,19 +29,12 @@ _HALF_TURN_RAD = 3.1  # a little less, between the ends of an edge as seen from 
 
 
 class NearActor(NamedTuple):
-    """An actor near the controlled vehicle.
+    """An actor near the controlled vehicle."""
 
-    Args:
-        squared: Squared distance of the centres, in m².
-        row: Row of the actor in the scene.
-        x: x of the centre of the rectangle, in m.
-        y: y of the centre of the rectangle, in m.
-    """
-
-    squared: float
-    row: int
-    x: float
-    y: float
+    squared: float  # squared distance of the centres, in m²
+    row: int  # row of the actor in the scene
+    x: float  # x of the centre of the rectangle, in m
+    y: float  # y of the centre of the rectangle, in m
 
 
 def wrapped(angle: float) -> float:

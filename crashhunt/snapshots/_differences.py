@@ -46,15 +46,10 @@ _FILES_OF_TOOLS = (".gitignore", ".gitattributes", ".gitmodules", ".editorconfig
 
 @dataclass(frozen=True, slots=True)
 class CodeChanges:
-    """The differences between two snapshots.
+    """The differences between two snapshots."""
 
-    Args:
-        changed: the files and versions on which the results of trials may depend, as texts.
-        added: the new files that do not count as a change.
-    """
-
-    changed: tuple[str, ...] = ()
-    added: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()  # the files and versions on which the results of trials may depend, as texts
+    added: tuple[str, ...] = ()  # the new files that do not count as a change
 
 
 def code_changes(then: Snapshot, now: Snapshot) -> CodeChanges:

@@ -40,18 +40,13 @@ _NOTATION: Final = "write signal:LOW:HIGH:points=N:kind=constant|linear|pchip, s
 
 @dataclass(frozen=True)
 class InputSignal:
-    """A value over time, for an agent, a scenario or a disturbance that is driven by signals.
+    """A value over time, for an agent, a scenario or a disturbance that is driven by signals."""
 
-    Args:
-        points: values of the signal. With the kind ``constant``, each holds for the same share of the duration.
-            Otherwise, the first is the value at 0 s, and the last the value at the end.
-        kind: ``constant``, ``linear`` or ``pchip`` (monotonic cubic interpolation; Fritsch and Carlson, 1980).
-        duration_s: duration of a trial, in s.
-    """
-
+    # values of the signal. With the kind ``constant``, each holds for the same share of the duration. Otherwise, the
+    # first is the value at 0 s, and the last the value at the end.
     points: tuple[float, ...]
-    kind: str
-    duration_s: float
+    kind: str  # ``constant``, ``linear`` or ``pchip`` (monotonic cubic interpolation; Fritsch and Carlson, 1980)
+    duration_s: float  # duration of a trial, in s
 
     def __call__(self, time_s: float) -> float:
         """Return the value at a time in s; before the begin and after the end, the nearest value."""

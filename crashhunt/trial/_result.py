@@ -261,26 +261,17 @@ class Branch(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Branches(Serializable):
-    """The results of the branches of a trial.
+    """The results of the branches of a trial."""
 
-    Args:
-        moments: Number of steps after which branches were started.
-        asked: Number of completed branches.
-        steps: Number of simulated steps of the branches.
-        left_out: Number of branches that were skipped because the budget of steps was used up.
-        crashes: The branches that crashed, in the order in which they were found.
-        unanswered: Number of planned branches that have no result.
-        why_unanswered: The reason for the first missing result; empty if no result is missing.
-        may_be_asked_again: Whether a reason lies outside of the trial, so that another run may complete all branches.
-    """
-
-    moments: int = 0
-    asked: int = 0
-    steps: int = 0
-    left_out: int = 0
-    crashes: tuple[Branch, ...] = ()
-    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
+    moments: int = 0  # number of steps after which branches were started
+    asked: int = 0  # number of completed branches
+    steps: int = 0  # number of simulated steps of the branches
+    left_out: int = 0  # number of branches that were skipped because the budget of steps was used up
+    crashes: tuple[Branch, ...] = ()  # the branches that crashed, in the order in which they were found
+    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)  # number of planned branches that have no result
+    # the reason for the first missing result; empty if no result is missing
     why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
+    # whether a reason lies outside of the trial, so that another run may complete all branches
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
 
     @property
@@ -364,36 +355,25 @@ class Forced(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Stress(Serializable):
-    """The results of the robustness probes of a trial.
+    """The results of the robustness probes of a trial."""
 
-    Args:
-        margin: The robustness margin: strength of the minimal disturbance that made a probe crash, as a share of the
-            strongest plausible disturbance. The margin is 1 if no probe crashed, and 0 if the trial crashed without a
-            disturbance. The margin is None if a probe has no result.
-        probes: Number of probes.
-        steps: Number of simulated steps of the probes.
-        left_out: Number of probes that were skipped because the budget of steps was used up.
-        disturbance: The minimal disturbance that made a probe crash; None if no probe crashed.
-        outcome: The outcome of the probe with the minimal disturbance.
-        step: The last step of the probe with the minimal disturbance.
-        moments: Number of steps after which probes were planned; 0 in results of earlier versions.
-        moments_asked: Number of these steps for which all probes have a result.
-        margin_upper_bound: If a probe has no result, an upper bound of the margin from the other probes.
-        why_unasked: The reason why a probe has no result; empty if all probes have a result.
-        may_be_asked_again: Whether the reason lies outside of the trial, so that another run may complete all probes.
-    """
-
+    # The robustness margin: strength of the minimal disturbance that made a probe crash, as a share of the strongest
+    # plausible disturbance. The margin is 1 if no probe crashed, and 0 if the trial crashed without a disturbance. The
+    # margin is None if a probe has no result.
     margin: float | None
-    probes: int = 0
-    steps: int = 0
-    left_out: int = 0
-    disturbance: Disturbance | None = None
-    outcome: str = ""
-    step: int = 0
-    moments: int = 0
-    moments_asked: int = 0
+    probes: int = 0  # number of probes
+    steps: int = 0  # number of simulated steps of the probes
+    left_out: int = 0  # number of probes that were skipped because the budget of steps was used up
+    disturbance: Disturbance | None = None  # the minimal disturbance that made a probe crash; None if no probe crashed
+    outcome: str = ""  # the outcome of the probe with the minimal disturbance
+    step: int = 0  # the last step of the probe with the minimal disturbance
+    moments: int = 0  # number of steps after which probes were planned; 0 in results of earlier versions
+    moments_asked: int = 0  # number of these steps for which all probes have a result
+    # if a probe has no result, an upper bound of the margin from the other probes
     margin_upper_bound: float | None = field(default=None, metadata=_NOT_ALL_ASKED)
+    # the reason why a probe has no result; empty if all probes have a result
     why_unasked: str = field(default="", metadata=_NOT_ALL_ASKED)
+    # whether the reason lies outside of the trial, so that another run may complete all probes
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ASKED)
 
     @property

@@ -58,30 +58,19 @@ class Overruled(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Handover(Serializable):
-    """A hand-over: a vehicle repeats recorded actions up to a step, and its agent acts after that.
+    """A hand-over: a vehicle repeats recorded actions up to a step, and its agent acts after that."""
 
-    Args:
-        agent: id of the controlled vehicle.
-        after: number of recorded actions to repeat; the agent makes its first decision in the next step.
-        log: path of the ``log.mcap`` that contains the recorded actions.
-    """
-
-    agent: str
-    after: int
-    log: str
+    agent: str  # id of the controlled vehicle
+    after: int  # number of recorded actions to repeat; the agent makes its first decision in the next step
+    log: str  # path of the ``log.mcap`` that contains the recorded actions
 
 
 @dataclass(frozen=True, slots=True)
 class Reseeding(Serializable):
-    """A re-seeding: the simulator's random generators get other seeds after a step.
+    """A re-seeding: the simulator's random generators get other seeds after a step."""
 
-    Args:
-        after: the step after which the seeds change; the next step is the first that uses the new seeds.
-        seed: seed of all random generators of the simulator, from 0 to 2**31 - 1.
-    """
-
-    after: int
-    seed: int
+    after: int  # the step after which the seeds change; the next step is the first that uses the new seeds
+    seed: int  # seed of all random generators of the simulator, from 0 to 2**31 - 1
 
     def seed_after(self, step: int) -> int | None:
         """Return the seed that the random generators get after a step; None if they are not re-seeded then."""

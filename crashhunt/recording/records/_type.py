@@ -22,13 +22,9 @@ Fields: TypeAlias = "Mapping[str, object]"
 
 
 class Form:
-    """The conversion of a payload to a log message and back, without losing a bit.
+    """The conversion of a payload to a log message and back, without losing a bit."""
 
-    Args:
-        messages: the possible protobuf messages, by name; each maps field names to types.
-    """
-
-    messages: Mapping[str, Mapping[str, str]]
+    messages: Mapping[str, Mapping[str, str]]  # the possible protobuf messages, by name; each maps field names to types
 
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return the name of the message, and the values of its fields."""
