@@ -201,19 +201,13 @@ watchdog = Watchdog()
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Resources that this process held before user code ran in it. Forks need no private copy of such resources.
+    """Resources that this process held before user code ran in it. Forks need no private copy of such resources."""
 
-    Args:
-        files: target of each open file descriptor.
-        children: process ids of child processes.
-        shared: names of memory shared with other processes; None to skip this check, which takes milliseconds.
-        threads: ids of threads.
-    """
-
-    files: Mapping[int, str] = field(default_factory=dict)
-    children: frozenset[int] = frozenset()
+    files: Mapping[int, str] = field(default_factory=dict)  # target of each open file descriptor
+    children: frozenset[int] = frozenset()  # process ids of child processes
+    # names of memory shared with other processes; None to skip this check, which takes milliseconds
     shared: frozenset[str] | None = frozenset()
-    threads: frozenset[str] = frozenset()
+    threads: frozenset[str] = frozenset()  # ids of threads
 
 
 def held(shared: frozenset[str] | None = None) -> Held:

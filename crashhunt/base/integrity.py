@@ -32,17 +32,12 @@ _SMALL_FILE_BYTES = 1 << 20  # bytes
 
 
 class FileEntry(TypedDict):
-    """The recorded size and digest of a file.
+    """The recorded size and digest of a file."""
 
-    Args:
-        size: size in bytes.
-        blake2b: the digest of its content, in hexadecimal.
-        executable: 1 if the owner may execute the file, such as a planner that an agent starts; else missing. No other
-            permission is recorded.
-    """
-
-    size: int
-    blake2b: str
+    size: int  # size in bytes
+    blake2b: str  # the digest of its content, in hexadecimal
+    # 1 if the owner may execute the file, such as a planner that an agent starts; else missing. No other permission is
+    # recorded.
     executable: NotRequired[int]
 
 

@@ -29,19 +29,12 @@ _TOKEN = re.compile(r"(?<![0-9])([0-9]{1,10})-([0-9]{1,20})-([0-9a-f]{12})-([0-9
 
 @dataclass(frozen=True, slots=True)
 class OwnerProcess:
-    """The process to which temporary files belong; their names contain its token.
+    """The process to which temporary files belong; their names contain its token."""
 
-    Args:
-        pid: process id in its own PID namespace.
-        started: start time of the process, in clock ticks since the machine booted.
-        boot: first 12 hexadecimal digits of the kernel's boot id.
-        namespace: checksum of the process's PID and time namespaces, 8 hexadecimal digits.
-    """
-
-    pid: int
-    started: int
-    boot: str
-    namespace: str
+    pid: int  # process id in its own PID namespace
+    started: int  # start time of the process, in clock ticks since the machine booted
+    boot: str  # first 12 hexadecimal digits of the kernel's boot id
+    namespace: str  # checksum of the process's PID and time namespaces, 8 hexadecimal digits
 
     @property
     def token(self) -> str:

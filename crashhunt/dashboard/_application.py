@@ -53,15 +53,10 @@ _SCRIPTS = ("common.js", "list.js", "hunt.js", "crash.js", "compare.js", "style.
 
 
 class Application(NamedTuple):
-    """The dashboard's application, which answers requests.
+    """The dashboard's application, which answers requests."""
 
-    Args:
-        asgi: the ASGI application.
-        close: function that ends all processes that the application has started.
-    """
-
-    asgi: ASGIApp
-    close: Callable[[], None]
+    asgi: ASGIApp  # the ASGI application
+    close: Callable[[], None]  # function that ends all processes that the application has started
 
 
 def make_application(catalog: Catalog, *, host: str, token: str = "", allow_control: bool = False) -> Application:

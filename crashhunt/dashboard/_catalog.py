@@ -38,23 +38,14 @@ _OWN_FILES = (
 
 @dataclass(frozen=True, slots=True)
 class FoundHunt:
-    """A hunt that the catalog has found.
+    """A hunt that the catalog has found."""
 
-    Args:
-        id: identifier in links: 16 hexadecimal digits that depend only on the path of the hunt.
-        path: path of the hunt's folder, with symbolic links resolved.
-        root: the folder named by the user that contains the hunt.
-        name: path of the hunt relative to `root`, or the name of its folder.
-        suite: folder that contains this and other hunts, relative to `root`; empty if there is none.
-        exported: whether the hunt was unpacked from a file that ``crashhunt export`` wrote.
-    """
-
-    id: str
-    path: Path
-    root: Path
-    name: str
-    suite: str
-    exported: bool = False
+    id: str  # identifier in links: 16 hexadecimal digits that depend only on the path of the hunt
+    path: Path  # path of the hunt's folder, with symbolic links resolved
+    root: Path  # the folder named by the user that contains the hunt
+    name: str  # path of the hunt relative to `root`, or the name of its folder
+    suite: str  # folder that contains this and other hunts, relative to `root`; empty if there is none
+    exported: bool = False  # whether the hunt was unpacked from a file that ``crashhunt export`` wrote
 
 
 class Catalog:

@@ -43,21 +43,13 @@ Point: TypeAlias = "dict[str, object]"
 
 
 class Prefix(NamedTuple):
-    """The first trials of a hunt, up to the first trial that has not ended.
+    """The first trials of a hunt, up to the first trial that has not ended."""
 
-    Args:
-        valid: number of trials that count.
-        invalid: number of trials that do not count.
-        crashes: number of valid trials that crashed.
-        steps: number of simulated steps of the valid trials.
-        excluded: number of trials that have ended although an earlier trial has not.
-    """
-
-    valid: int
-    invalid: int
-    crashes: int
-    steps: int
-    excluded: int
+    valid: int  # number of trials that count
+    invalid: int  # number of trials that do not count
+    crashes: int  # number of valid trials that crashed
+    steps: int  # number of simulated steps of the valid trials
+    excluded: int  # number of trials that have ended although an earlier trial has not
 
 
 class _Part:

@@ -46,18 +46,12 @@ _ISSUES_URL: Final = "https://github.com/crashhunt/crashhunt/issues"
 
 @dataclass(frozen=True, slots=True)
 class Blame:
-    """The origin of an exception.
+    """The origin of an exception."""
 
-    Args:
-        error: The exception itself, without its wrapper.
-        party: The origin, as text: the owner of the code that raised the exception.
-        place: The purpose for which the failed code was called; empty if it is unknown.
-        is_resource: Whether memory or file handles ran out in crashhunt's own code, so that the origin is unknown.
-    """
-
-    error: BaseException
-    party: Party
-    place: str = ""
+    error: BaseException  # the exception itself, without its wrapper
+    party: Party  # the origin, as text: the owner of the code that raised the exception
+    place: str = ""  # the purpose for which the failed code was called; empty if it is unknown
+    # whether memory or file handles ran out in crashhunt's own code, so that the origin is unknown
     is_resource: bool = False
 
 

@@ -65,21 +65,13 @@ class _StoredFork:
 
 @dataclass(frozen=True, slots=True)
 class _Crashed:
-    """A branch that crashed, with its disturbances.
+    """A branch that crashed, with its disturbances."""
 
-    Args:
-        took_place: the disturbances of the branch that took place.
-        branched: the step after which the branch began.
-        outcome: outcome of the branch.
-        step: step at which the branch ended.
-        log_likelihood: log-likelihood of the disturbances, as in `Branch`.
-    """
-
-    took_place: tuple[Disturbance, ...]
-    branched: int
-    outcome: str
-    step: int
-    log_likelihood: float | None
+    took_place: tuple[Disturbance, ...]  # the disturbances of the branch that took place
+    branched: int  # the step after which the branch began
+    outcome: str  # outcome of the branch
+    step: int  # step at which the branch ended
+    log_likelihood: float | None  # log-likelihood of the disturbances, as in `Branch`
 
 
 class Brancher(Observer):

@@ -57,23 +57,16 @@ class _Filter(Protocol):
 
 @dataclass(slots=True)
 class _OngoingDisturbance:
-    """A disturbance that has begun and has not ended.
+    """A disturbance that has begun and has not ended."""
 
-    Args:
-        last: The last step of the disturbance.
-        vehicle: The disturbed vehicle, or the agent if its observations or actions are disturbed.
-        what: The kind of the disturbance.
-        active: The simulator's disturbance of a vehicle; None if the agent itself is disturbed.
-        filters: Object that changes the agent's observations or actions; None if a vehicle is disturbed.
-        after: Number of steps after the last one in which observations still contain disturbed ones.
-    """
-
-    last: int
-    vehicle: str
-    what: str
+    last: int  # the last step of the disturbance
+    vehicle: str  # the disturbed vehicle, or the agent if its observations or actions are disturbed
+    what: str  # the kind of the disturbance
+    # the simulator's disturbance of a vehicle; None if the agent itself is disturbed
     active: ActiveDisturbance | None = None
+    # object that changes the agent's observations or actions; None if a vehicle is disturbed
     filters: _Filter | None = None
-    after: int = 0
+    after: int = 0  # number of steps after the last one in which observations still contain disturbed ones
 
 
 class DisturbanceInjector:

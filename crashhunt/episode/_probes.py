@@ -40,23 +40,15 @@ _STEPS_TO_ONSET = 2  # steps on: what an agent sees late is noticed a step befor
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A kind of disturbance that probes try, and the order in which its strengths are tried.
+    """A kind of disturbance that probes try, and the order in which its strengths are tried."""
 
-    Args:
-        what: kind of the disturbance.
-        who: the places around the agent at which an actor is disturbed, tried in this order.
-        most: the strongest plausible value, in the unit of the kind.
-        how_long: the longest duration, in s.
-        least: the greatest value that has no effect, in the unit of the kind.
-        grade: the property that varies: strength or duration. If neither varies, the disturbance happens or not, and a
-            crash counts as half the maximum strength.
-    """
-
-    what: str
-    who: tuple[str, ...]
-    most: float
-    how_long: float
-    least: float = 0.0
+    what: str  # kind of the disturbance
+    who: tuple[str, ...]  # the places around the agent at which an actor is disturbed, tried in this order
+    most: float  # the strongest plausible value, in the unit of the kind
+    how_long: float  # the longest duration, in s
+    least: float = 0.0  # the greatest value that has no effect, in the unit of the kind
+    # the property that varies: strength or duration. If neither varies, the disturbance happens or not, and a crash
+    # counts as half the maximum strength.
     grade: Literal["strength", "length", "whether"] = "strength"
 
     def shares(self, step_length_s: float) -> tuple[float, ...]:

@@ -87,19 +87,12 @@ help = "speed of the controlled vehicle minus speed of the vehicle that cuts in"
 
 @dataclass(frozen=True, slots=True)
 class ReadParameters:
-    """A scenario that was made from the parameters of an OpenSCENARIO file.
+    """A scenario that was made from the parameters of an OpenSCENARIO file."""
 
-    Args:
-        directory: folder of the scenario.
-        scenario: the included scenario of which it is a variant.
-        read: the argument and its values for each parameter that was read.
-        not_read: the other parameters, each with the reason or its value.
-    """
-
-    directory: Path
-    scenario: str
-    read: Mapping[str, str]
-    not_read: tuple[str, ...]
+    directory: Path  # folder of the scenario
+    scenario: str  # the included scenario of which it is a variant
+    read: Mapping[str, str]  # the argument and its values for each parameter that was read
+    not_read: tuple[str, ...]  # the other parameters, each with the reason or its value
 
     def to_json(self) -> JsonObject:
         """Return JSON-compatible data."""

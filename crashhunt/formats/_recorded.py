@@ -26,36 +26,22 @@ _SAME_WAY_RAD = math.pi / 3  # and in about its direction; a lane that only cros
 
 
 class Pose(NamedTuple):
-    """The position of the centre of an actor after a step.
+    """The position of the centre of an actor after a step."""
 
-    Args:
-        step: number of the step; 0 is before the first step.
-        x: x of the centre, in m.
-        y: y of the centre, in m.
-        z: z of the centre, in m; 0 if the map is flat.
-        heading: heading in rad, from -pi to pi, counter-clockwise from the x axis.
-        speed: speed in m/s.
-    """
-
-    step: int
-    x: float
-    y: float
-    z: float
-    heading: float
-    speed: float
+    step: int  # number of the step; 0 is before the first step
+    x: float  # x of the centre, in m
+    y: float  # y of the centre, in m
+    z: float  # z of the centre, in m; 0 if the map is flat
+    heading: float  # heading in rad, from -pi to pi, counter-clockwise from the x axis
+    speed: float  # speed in m/s
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedPath:
-    """The path of an actor while it was in sight. An actor that came back into sight has several paths.
+    """The path of an actor while it was in sight. An actor that came back into sight has several paths."""
 
-    Args:
-        path: the path as it was recorded.
-        name: name of the path, unique in the file, of letters, digits, points, dashes and underscores.
-    """
-
-    path: Path
-    name: str
+    path: Path  # the path as it was recorded
+    name: str  # name of the path, unique in the file, of letters, digits, points, dashes and underscores
 
     @property
     def poses(self) -> list[Pose]:
@@ -76,19 +62,13 @@ class RecordedPath:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """A lane, with the lanes before and after it.
+    """A lane, with the lanes before and after it."""
 
-    Args:
-        right: right border of the lane, shape (n, 2), in m.
-        left: left border of the lane, with as many points.
-        after: numbers of the lanes that begin where this lane ends, derived from shapes, because recordings lack them.
-        before: numbers of the lanes that end where this lane begins.
-    """
-
-    right: NDArray[np.float64]
-    left: NDArray[np.float64]
+    right: NDArray[np.float64]  # right border of the lane, shape (n, 2), in m
+    left: NDArray[np.float64]  # left border of the lane, with as many points
+    # numbers of the lanes that begin where this lane ends, derived from shapes, because recordings lack them
     after: tuple[int, ...]
-    before: tuple[int, ...]
+    before: tuple[int, ...]  # numbers of the lanes that end where this lane begins
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -103,25 +83,15 @@ class Road:
 
 @dataclass(frozen=True, slots=True)
 class RecordedCrash:
-    """The recorded parts of a crash that are exported.
+    """The recorded parts of a crash that are exported."""
 
-    Args:
-        title: description of the crash, in one line.
-        number: number of the crash's trial.
-        step_length_s: step length in s.
-        steps: number of recorded steps.
-        agents: paths of the controlled vehicles.
-        others: the paths of all other actors.
-        roads: the lanes that an agent came near.
-    """
-
-    title: str
-    number: int
-    step_length_s: float
-    steps: int
-    agents: tuple[RecordedPath, ...]
-    others: tuple[RecordedPath, ...]
-    roads: tuple[Road, ...]
+    title: str  # description of the crash, in one line
+    number: int  # number of the crash's trial
+    step_length_s: float  # step length in s
+    steps: int  # number of recorded steps
+    agents: tuple[RecordedPath, ...]  # paths of the controlled vehicles
+    others: tuple[RecordedPath, ...]  # the paths of all other actors
+    roads: tuple[Road, ...]  # the lanes that an agent came near
 
 
 def recorded_of(bundle: Bundle) -> RecordedCrash:

@@ -31,15 +31,10 @@ _MAX_TURN_RAD, _MAX_GAP_M = math.pi / 2, 6.0
 
 
 class _Line(NamedTuple):
-    """The centre line of a lane, in the frame of scenes.
+    """The centre line of a lane, in the frame of scenes."""
 
-    Args:
-        along: distance of each point from the first one, in m.
-        rows: columns of each point: 1, x, y, heading (continuous, in rad), width, speed limit, lane index.
-    """
-
-    along: Array
-    rows: Array
+    along: Array  # distance of each point from the first one, in m
+    rows: Array  # columns of each point: 1, x, y, heading (continuous, in rad), width, speed limit, lane index
 
     def nearest(self, x: float, y: float) -> tuple[float, float]:
         """Return the distance of a point from the line, and how far along the line the nearest point is, in m."""

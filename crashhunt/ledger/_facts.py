@@ -40,67 +40,41 @@ class UntilRate(TypedDict):
 
 
 class RateBounds(TypedDict):
-    """A confidence interval of a rate.
+    """A confidence interval of a rate."""
 
-    Args:
-        low: the lower bound.
-        high: the upper bound; None if there is no upper bound.
-    """
-
-    low: float
-    high: float | None
+    low: float  # the lower bound
+    high: float | None  # the upper bound; None if there is no upper bound
 
 
 class RunningRate(TypedDict):
-    """The current crash rate of a hunt, as ``status --json`` reports it.
+    """The current crash rate of a hunt, as ``status --json`` reports it."""
 
-    Args:
-        method: either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances together with plain
-            trials.
-        per: the unit of exposure to which the rate refers, such as a trial or a kilometre.
-        confidence: confidence of all intervals, in percent.
-        units: number of independent units that count: trials, traffic seeds, or trials from which forks start.
-        trials: number of plain trials that count.
-        crashes: number of crashes in the trials that ``trials`` counts.
-        origin: the origin of the trials that count; empty if all trials count.
-        certain: interval that is valid whenever the user looks at it; None if there is none.
-        estimate: crash probability per trial, estimated from the forks; None if there is no estimate.
-        estimated: interval of the estimate; None if there are too few trials from which forks start.
-        why_not: why the certain interval or the estimated interval is missing; empty if neither is missing.
-        bar: threshold with which the rate is compared; None if there is no threshold.
-        verdict: either ``below``, ``above`` or ``undecided``; empty if there is no threshold.
-        trained_on: number of trials that do not count because an agent was trained on their traffic; missing if all
-            trials count.
-    """
-
+    # either ``plain`` for counted trials, or ``rare`` for forks with forced disturbances together with plain trials
     method: Literal["plain", "rare"]
+    # the unit of exposure to which the rate refers, such as a trial or a kilometre
     per: Literal["trial", "hour", "1000km"]
-    confidence: float
-    units: int
-    trials: int
-    crashes: int
-    origin: str
-    certain: RateBounds | None
-    estimate: float | None
-    estimated: RateBounds | None
-    why_not: str
-    bar: float | None
-    verdict: str
+    confidence: float  # confidence of all intervals, in percent
+    units: int  # number of independent units that count: trials, traffic seeds, or trials from which forks start
+    trials: int  # number of plain trials that count
+    crashes: int  # number of crashes in the trials that ``trials`` counts
+    origin: str  # the origin of the trials that count; empty if all trials count
+    certain: RateBounds | None  # interval that is valid whenever the user looks at it; None if there is none
+    estimate: float | None  # crash probability per trial, estimated from the forks; None if there is no estimate
+    estimated: RateBounds | None  # interval of the estimate; None if there are too few trials from which forks start
+    why_not: str  # why the certain interval or the estimated interval is missing; empty if neither is missing
+    bar: float | None  # threshold with which the rate is compared; None if there is no threshold
+    verdict: str  # either ``below``, ``above`` or ``undecided``; empty if there is no threshold
+    # number of trials that do not count because an agent was trained on their traffic; missing if all trials count
     trained_on: NotRequired[int]
 
 
 class CodeVersionsData(TypedDict):
-    """The versions of the code with which the trials of a hunt ran.
+    """The versions of the code with which the trials of a hunt ran."""
 
-    Args:
-        snapshots: digests of the snapshots of each version, the first version first.
-        newest: position in ``snapshots`` of the version that ran last.
-        first: number of the first trial that counts for figures of this version. No trial from this number on had begun
-            with another version.
-    """
-
-    snapshots: list[list[str]]
-    newest: int
+    snapshots: list[list[str]]  # digests of the snapshots of each version, the first version first
+    newest: int  # position in ``snapshots`` of the version that ran last
+    # number of the first trial that counts for figures of this version. No trial from this number on had begun with
+    # another version.
     first: int
 
 
@@ -194,15 +168,10 @@ class Noted(TypedDict, total=False):
 
 
 class Facts(Noted, total=False):
-    """All facts about a hunt.
+    """All facts about a hunt."""
 
-    Args:
-        state: the last recorded state: ``running``, ``error``, or the reason why the hunt stopped.
-        detail: the reason for the state, as text.
-    """
-
-    state: str
-    detail: str | None
+    state: str  # the last recorded state: ``running``, ``error``, or the reason why the hunt stopped
+    detail: str | None  # the reason for the state, as text
 
 
 class Seal(TypedDict):

@@ -141,16 +141,11 @@ _CHOICE = re.compile(r"(?P<name>.+?)(?::(?P<arguments>[A-Za-z_]\w*=.*))?")
 
 @dataclass(frozen=True, slots=True)
 class OracleChoice:
-    """An oracle with its arguments.
+    """An oracle with its arguments."""
 
-    Args:
-        name: name of a registered object, or ``module:attribute``.
-        arguments: arguments by name.
-        factory: the object with this name, stored because each trial creates an oracle and a lookup takes milliseconds.
-    """
-
-    name: str
-    arguments: dict[str, Value]
+    name: str  # name of a registered object, or ``module:attribute``
+    arguments: dict[str, Value]  # arguments by name
+    # the object with this name, stored because each trial creates an oracle and a lookup takes milliseconds
     factory: Callable[..., Oracle]
 
     def make(self) -> Oracle:

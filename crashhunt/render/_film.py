@@ -38,26 +38,18 @@ _AROUND_S = 10.0  # of a near miss, half of it before and half after
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilmOptions:
-    """The options of a film.
+    """The options of a film."""
 
-    Args:
-        fps: pictures per second; by default as many as there are steps per second, so that the film runs in real time.
-        size: size of the scene, in pixels.
-        last_s: duration to show, in s: the end of a crash, or the time around the nearest moment of a near miss. 0
-            shows the whole crash, or 10 s of a near miss.
-        last_step_repeats: number of times that the last picture is repeated.
-        blank_frames: number of blank pictures between two crashes.
-        panels: whether to show panels next to the scene.
-        scale: scale of the scene, in pixels per metre.
-    """
-
+    # pictures per second; by default as many as there are steps per second, so that the film runs in real time
     fps: float = 0.0
-    size: tuple[int, int] = (960, 540)
+    size: tuple[int, int] = (960, 540)  # size of the scene, in pixels
+    # duration to show, in s: the end of a crash, or the time around the nearest moment of a near miss. 0 shows the
+    # whole crash, or 10 s of a near miss.
     last_s: float = 0.0
-    last_step_repeats: int = 10
-    blank_frames: int = 10
-    panels: bool = True
-    scale: float = 8.0
+    last_step_repeats: int = 10  # number of times that the last picture is repeated
+    blank_frames: int = 10  # number of blank pictures between two crashes
+    panels: bool = True  # whether to show panels next to the scene
+    scale: float = 8.0  # scale of the scene, in pixels per metre
 
     def __post_init__(self) -> None:
         for name, value, least in (
@@ -72,31 +64,19 @@ class FilmOptions:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One crash or near miss of a film.
+    """One crash or near miss of a film."""
 
-    Args:
-        recording: recording of the crash.
-        lanes: lanes of the crash's map.
-        agent: identifier of the vehicle in the centre of the picture.
-        other: identifier of the collision partner.
-        crash_step: the step of the crash.
-        panels: pictures of the agent's own panels, by step and label.
-        meanings: names of the agent's discrete actions, if they are known.
-        nearest: for a near miss, the step around which the film is made; -1 for a crash, with which the film ends.
-        crash_words: text above the step of the crash.
-        obstacles: outlines of the obstacles of the crash's map.
-    """
-
-    recording: Recording
-    lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
-    agent: str
-    other: str
-    crash_step: int
-    panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]
-    meanings: Sequence[str] = ()
+    recording: Recording  # recording of the crash
+    lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]  # lanes of the crash's map
+    agent: str  # identifier of the vehicle in the centre of the picture
+    other: str  # identifier of the collision partner
+    crash_step: int  # the step of the crash
+    panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]  # pictures of the agent's own panels, by step and label
+    meanings: Sequence[str] = ()  # names of the agent's discrete actions, if they are known
+    # for a near miss, the step around which the film is made; -1 for a crash, with which the film ends
     nearest: int = -1
-    crash_words: str = "CRASH"
-    obstacles: Sequence[NDArray[np.float64]] = ()
+    crash_words: str = "CRASH"  # text above the step of the crash
+    obstacles: Sequence[NDArray[np.float64]] = ()  # outlines of the obstacles of the crash's map
 
 
 class Layout:

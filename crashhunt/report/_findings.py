@@ -30,27 +30,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CrashFinding:
-    """A crash type, and the line of code at which an annotation for it is shown.
+    """A crash type, and the line of code at which an annotation for it is shown."""
 
-    Args:
-        rule: outcome of the crashes, such as ``collision``.
-        title: title of the crash type.
-        message: summary of the shortest crash, and the command that shows it.
-        file: the agent's file, relative to its project; empty if unknown.
-        line: line in the file, counted from 1: of the failure, or else of the agent's definition.
-        fingerprint: identifier of the crash type, which is the same in every hunt.
-        known: name of the corpus case with the same crash type; empty if there is no such case.
-        group: the crashes of the crash type.
-    """
-
-    rule: str
-    title: str
-    message: str
-    file: str
-    line: int
-    fingerprint: str
-    known: str
-    group: Group
+    rule: str  # outcome of the crashes, such as ``collision``
+    title: str  # title of the crash type
+    message: str  # summary of the shortest crash, and the command that shows it
+    file: str  # the agent's file, relative to its project; empty if unknown
+    line: int  # line in the file, counted from 1: of the failure, or else of the agent's definition
+    fingerprint: str  # identifier of the crash type, which is the same in every hunt
+    known: str  # name of the corpus case with the same crash type; empty if there is no such case
+    group: Group  # the crashes of the crash type
 
 
 def findings_of(groups: Sequence[Group], known: Mapping[Signature, str] | None = None) -> list[CrashFinding]:

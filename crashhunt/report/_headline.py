@@ -33,29 +33,17 @@ _MANOEUVRE_WORDS = {
 
 
 class CrashFacts(Protocol):
-    """The facts of a crash on which the verdict is based; a `Story` provides them.
+    """The facts of a crash on which the verdict is based; a `Story` provides them."""
 
-    Attributes:
-        bundle: the crash or near miss.
-        recording: its recording.
-        agent: the controlled vehicle.
-        other: the actor that the agent touched or nearly touched; empty if there is none.
-        contact: record of the first contact with this actor; None if the two did not touch.
-        nearest: the moment of the greatest criticality; None for a crash.
-        encounter: the motion of the agent and this actor, in all steps; None if there is no such actor.
-        judgement: result of `judge`; None if `judge` has not run.
-        fault: the vehicle at fault.
-    """
-
-    bundle: Bundle
+    bundle: Bundle  # the crash or near miss
     recording: Recording
-    agent: str
-    other: str
-    contact: ContactRecord | None
-    nearest: DangerousMoment | None
-    encounter: Encounter | None
-    judgement: Judgement | None
-    fault: Fault
+    agent: str  # the controlled vehicle
+    other: str  # the actor that the agent touched or nearly touched; empty if there is none
+    contact: ContactRecord | None  # record of the first contact with this actor; None if the two did not touch
+    nearest: DangerousMoment | None  # the moment of the greatest criticality; None for a crash
+    encounter: Encounter | None  # the motion of the agent and this actor, in all steps; None if there is no such actor
+    judgement: Judgement | None  # result of `judge`; None if `judge` has not run
+    fault: Fault  # the vehicle at fault
 
 
 def verdict_of(story: CrashFacts) -> str:

@@ -223,20 +223,13 @@ def write_report(
 
 
 class PlayerParts(NamedTuple):
-    """The parts of pages that the report and the dashboard share.
+    """The parts of pages that the report and the dashboard share."""
 
-    Args:
-        style: CSS: the colours of both colour schemes, and the style of the controls.
-        controls: HTML of the scene, the controls and the curves.
-        script: JavaScript for the end of the page; its functions ``load`` and ``show`` take the data that `player_data`
-            returns.
-        numbers: JavaScript with ``formatNumber``, ``formatPercent`` and ``importanceBars``, the nodes of a chart.
-    """
-
-    style: str
-    controls: str
+    style: str  # CSS: the colours of both colour schemes, and the style of the controls
+    controls: str  # HTML of the scene, the controls and the curves
+    # JavaScript for the end of the page; its functions ``load`` and ``show`` take the data that `player_data` returns
     script: str
-    numbers: str
+    numbers: str  # JavaScript with ``formatNumber``, ``formatPercent`` and ``importanceBars``, the nodes of a chart
 
 
 def player_parts() -> PlayerParts:

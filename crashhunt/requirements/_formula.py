@@ -18,18 +18,13 @@ BinaryTemporal = Literal["until", "since"]
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """An interval of seconds relative to a sample, with both bounds included.
+    """An interval of seconds relative to a sample, with both bounds included."""
 
-    Args:
-        begin_s: distance of the nearer bound, in s; at least 0.
-        end_s: distance of the farther bound, in s; None if the window reaches to the end of the trace (or, for an
-            operator of the past, to its beginning).
-        span: place in the text; empty for an operator without a window.
-    """
-
-    begin_s: float = 0.0
+    begin_s: float = 0.0  # distance of the nearer bound, in s; at least 0
+    # distance of the farther bound, in s; None if the window reaches to the end of the trace (or, for an operator of
+    # the past, to its beginning)
     end_s: float | None = None
-    span: Span = (0, 0)
+    span: Span = (0, 0)  # place in the text; empty for an operator without a window
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +45,11 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class Apply:
-    """An arithmetic operator or a function, applied to terms.
+    """An arithmetic operator or a function, applied to terms."""
 
-    Args:
-        span: place in the text.
-        operator: ``+``, ``-``, ``*``, ``/``, ``neg`` or the name of a function.
-        terms: the operands.
-    """
-
-    span: Span
-    operator: str
-    terms: tuple[Term, ...]
+    span: Span  # place in the text
+    operator: str  # ``+``, ``-``, ``*``, ``/``, ``neg`` or the name of a function
+    terms: tuple[Term, ...]  # the operands
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,19 +19,12 @@ _SAFE = "gap_m >= (speed * speed - leader_speed * leader_speed) / 20 + 0.3 * spe
 
 @dataclass(frozen=True, slots=True)
 class TrafficRule:
-    """A requirement that ``--require`` accepts by name.
+    """A requirement that ``--require`` accepts by name."""
 
-    Args:
-        name: name for ``--require``.
-        title: what the rule requires, in a sentence.
-        source: publication and rule, and how the formula differs from it.
-        formula: formula of the requirement.
-    """
-
-    name: str
-    title: str
-    source: str
-    formula: str
+    name: str  # name for ``--require``
+    title: str  # what the rule requires, in a sentence
+    source: str  # publication and rule, and how the formula differs from it
+    formula: str  # formula of the requirement
 
 
 TRAFFIC_RULES = {

@@ -64,15 +64,10 @@ def check_test_share(test: float, shown: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class SavedCrash(Serializable):
-    """A saved crash, for training or for tests.
+    """A saved crash, for training or for tests."""
 
-    Args:
-        bundle: bundle of the crash.
-        is_test: whether the traffic seed of the crash belongs to the test part.
-    """
-
-    bundle: Bundle
-    is_test: bool
+    bundle: Bundle  # bundle of the crash
+    is_test: bool  # whether the traffic seed of the crash belongs to the test part
 
     json_keys = ("id=bundle.id", "hunt=bundle.hunt", "path=bundle.path", "seed")
 
@@ -89,17 +84,11 @@ class SavedCrash(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Split(Serializable):
-    """Saved crashes, split into a training part and a test part.
+    """Saved crashes, split into a training part and a test part."""
 
-    Args:
-        test: share of the traffic seeds in the test part.
-        crashes: all crashes, in the order of the given directories and of their trials.
-        faults: number of omitted software faults, which an agent cannot learn to avoid by driving.
-    """
-
-    test: float
-    crashes: tuple[SavedCrash, ...]
-    faults: int = 0
+    test: float  # share of the traffic seeds in the test part
+    crashes: tuple[SavedCrash, ...]  # all crashes, in the order of the given directories and of their trials
+    faults: int = 0  # number of omitted software faults, which an agent cannot learn to avoid by driving
 
     json_keys = ("test", "training", "held_out", "software_faults=faults")
 
@@ -155,17 +144,11 @@ _SCHEMA = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainedOn:
-    """The traffic seeds on which a policy was trained.
+    """The traffic seeds on which a policy was trained."""
 
-    Args:
-        test: share of the test part, which is never used for training.
-        seeds: seeds of the crashes that were used for training.
-        hunt_seeds: seeds of the hunts that found these crashes. Traffic seeds of these hunts without a crash are split
-            as well.
-    """
-
-    test: float
-    seeds: frozenset[int] = frozenset()
+    test: float  # share of the test part, which is never used for training
+    seeds: frozenset[int] = frozenset()  # seeds of the crashes that were used for training
+    # seeds of the hunts that found these crashes. Traffic seeds of these hunts without a crash are split as well.
     hunt_seeds: frozenset[int] = frozenset()
 
     def write(self, path: Path) -> None:

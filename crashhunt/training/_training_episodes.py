@@ -283,23 +283,16 @@ def _require_same(first: _Stage, other: _Stage) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """The recorded steps up to the step at which the caller takes over.
+    """The recorded steps up to the step at which the caller takes over."""
 
-    Args:
-        spec: The trial of the crash.
-        crash_step: The number of the step of the crash.
-        actions: The encoded actions of the caller's vehicle in the recorded steps.
-        observations: The digest of the caller's observation in each step; empty if the recording has no observations.
-        scenes: For the start and each step, the recorded actors and the digest of their states.
-        is_compact: Whether the recording contains only some of the actors.
-    """
-
-    spec: TrialSpec
-    crash_step: int
-    actions: tuple[NDArray[np.generic], ...]
+    spec: TrialSpec  # the trial of the crash
+    crash_step: int  # the number of the step of the crash
+    actions: tuple[NDArray[np.generic], ...]  # the encoded actions of the caller's vehicle in the recorded steps
+    # the digest of the caller's observation in each step; empty if the recording has no observations
     observations: tuple[bytes, ...]
+    # for the start and each step, the recorded actors and the digest of their states
     scenes: tuple[tuple[tuple[str, ...], bytes], ...]
-    is_compact: bool
+    is_compact: bool  # whether the recording contains only some of the actors
 
     @classmethod
     def of(cls, rerun: Rerun, agent: str, before_s: float) -> _Start:
