@@ -6,11 +6,9 @@ import sys
 from contextlib import closing, suppress
 from dataclasses import replace
 
-import pytest
 from conftest import examples
 from hypothesis import given, settings, strategies as st
 
-from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts._next_trials import find_unanswered
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.results import TrialRow
@@ -22,24 +20,6 @@ from crashhunt.world import ClosestApproach
 def result(number: int, outcome: Outcome = Outcome.SURVIVED, *, ttc: float = 3.0, steps: int = 10) -> TrialResult:
     spec = TrialSpec(number, 7 * number, {"ego": {"speed": 1.5}}, {"vehicles": 3}, max_steps=20)
     return TrialResult(spec, outcome, steps=steps, wall_s=0.1, closest=ClosestApproach(ttc, 1.0, 2.0))
-
-
-def test_what_was_recorded_is_read_while_it_is_written(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    writer = Ledger(path, writable=True)
-    reader = Ledger(path)
-    writer.record(result(2, Outcome.COLLISION), snapshot="abc")
-    assert reader.finished() == {2}
-    writer.record(result(1), snapshot="abc")
-    assert list(reader.results()) == [result(1), result(2, Outcome.COLLISION)]
-    assert list(reader.results(outcomes=("collision",))) == [result(2, Outcome.COLLISION)]
-    assert reader.outcomes() == {"collision": 1, "survived": 1}
-    assert reader.steps_total() == 20
-    assert reader.result(2) == result(2, Outcome.COLLISION)
-    assert reader.result(3) is None
-    assert reader.snapshot_of(2) == "abc"
-    writer.close()
-    reader.close()
 
 
 def test_a_ledger_in_a_folder_that_is_not_writable_is_read(tmp_path, monkeypatch):
@@ -109,17 +89,6 @@ def test_what_is_recorded_together_is_not_kept_back_while_trials_are_waited_for(
         assert reader.finished() == {1, 2, 3, 4, 5, 6}
 
 
-def test_every_state_is_written_down(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.sqlite", writable=True)
-    ledger.enter("running", owner={"pid": 1})
-    ledger.enter("error", "no disk")
-    assert [event[1:] for event in ledger.events()] == [("running", ""), ("error", "no disk")]
-    assert ledger.facts() == {"state": "error", "detail": "no disk", "owner": {"pid": 1}}
-    ledger.enter("running")
-    assert "detail" not in ledger.facts()
-    ledger.close()
-
-
 def test_an_empty_file_is_no_ledger_yet(tmp_path):
     path = tmp_path / "ledger.sqlite"
     with closing(sqlite3.connect(path)) as database:  # as whoever looks too early does
@@ -163,22 +132,6 @@ def test_the_one_that_sees_a_ledger_can_read_it(tmp_path):
         finally:
             reader.kill()
     assert reader.returncode == 0
-
-
-def test_damage_in_the_middle_is_reported_whatever_is_read(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    ledger = Ledger(path, writable=True)
-    for number in range(300):
-        ledger.record(result(number), snapshot="")
-    ledger.close()
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 :] = b"\x55" * (len(data) - len(data) // 2)
-    path.write_bytes(data)
-    found = Ledger(path)
-    for read in (found.outcomes, found.finished, found.nearest_miss, lambda: list(found.results()), found.table):
-        with pytest.raises(HuntDirectoryError, match=r"malformed|not a ledger"):
-            list(read() or [])
-    found.close()
 
 
 def test_a_trial_that_ran_again_counts_once(tmp_path):

@@ -82,12 +82,6 @@ def test_numbers_are_in_order_over_several_outcomes(ledger):
     assert (ledger.last_number(), ledger.replaced_count()) == (5, 2)
 
 
-def test_ledger_without_trials_has_no_last_one(ledger):
-    assert ledger.last_number() == -1
-    assert ledger.nearest_miss() is None
-    assert ledger.plain_trial(0) is None
-
-
 def test_killed_trials_are_found_from_a_number_on(ledger):
     killed = Failure(KILLED, "out of memory")
     for number in (0, 3, 4):
@@ -293,15 +287,6 @@ def test_untouched_reader_sees_what_a_running_hunt_has_written(ledger, path):
         assert reader.finished() == {0, 1}
 
 
-def test_content_is_more_than_a_file(tmp_path):
-    file = tmp_path / "file"
-    assert _schema.has_content(file) is False
-    file.touch()
-    assert _schema.has_content(file) is False
-    file.write_text("x")
-    assert _schema.has_content(file) is True
-
-
 @pytest.mark.parametrize("read_only", [False, True])
 def test_ledger_is_used_by_several_threads(ledger, path, read_only):
     write(ledger, result(0))
@@ -381,20 +366,6 @@ def test_copied_row_has_the_columns_of_today(ledger, tmp_path):
             assert other.result(0).spec == result(0).spec
             (columns,) = other._database.execute("SELECT danger, other_steps FROM trials")
             assert columns == (*row[11:count], None, None)[:2]
-
-
-def test_rewritten_ledger_leaves_the_connection_of_the_removed_file(path):
-    writer = Ledger(path, writable=True)
-    write(writer, result(0))
-    old = writer._database
-    path.unlink()
-    assert writer.restore() is True
-    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
-        old.execute("SELECT 1")
-    assert writer._database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-    with pytest.raises(HuntDirectoryError, match="the ledger is damaged: Cannot operate on a closed database"):
-        _schema.rewrite(old, path)
-    writer.close()
 
 
 # Versions.

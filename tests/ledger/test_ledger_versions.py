@@ -164,17 +164,6 @@ def test_a_ledger_of_later_that_asks_for_more_is_refused(tmp_path):
             Ledger(path, writable=writable)
 
 
-def test_a_proposal_that_is_gone_is_missed(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    write(path)
-    with closing(sqlite3.connect(path)) as database, database:
-        database.execute("DELETE FROM proposals WHERE turn = 2")
-    with closing(Ledger(path)) as ledger, pytest.raises(HuntDirectoryError, match="its proposals differ from those"):
-        list(ledger.turns())
-    with pytest.raises(HuntDirectoryError, match="missing or have changed"):
-        Ledger(path, writable=True)
-
-
 def test_what_trials_cost_besides_is_summed(tmp_path):
     path = tmp_path / "ledger.sqlite"
     write(path)
@@ -186,15 +175,6 @@ def test_what_trials_cost_besides_is_summed(tmp_path):
     with closing(Ledger(path)) as ledger:
         assert ledger.steps_total() == 782
         assert [ledger.result(number).setup_steps for number in (2, 3, 4)] == [None, 200, 0]
-
-
-def test_what_ranks_trials_is_sealed(tmp_path):
-    path = tmp_path / "ledger.sqlite"
-    write(path)
-    with closing(sqlite3.connect(path)) as database, database:
-        database.execute("UPDATE trials SET danger = 0.4 WHERE number = 4")
-    with pytest.raises(HuntDirectoryError, match="missing or have changed"):
-        Ledger(path, writable=True)
 
 
 def test_of_trials_as_dangerous_the_first_is_the_nearest_miss(tmp_path):
