@@ -77,13 +77,10 @@ class Budget:
     Args:
         stopped: function that returns whether the user requests a stop; called repeatedly.
         time_s: wall-time limit from now on, in s; None for no limit.
-
-    Attributes:
-        why: the reason for the stop, as the user reads it; empty while the runs may continue.
     """
 
     def __init__(self, stopped: Callable[[], bool], time_s: float | None = None) -> None:
-        self.why = ""
+        self.why = ""  # the reason for the stop, as the user reads it; empty while the runs may continue
         self._stopped = stopped
         self._until = None if time_s is None else time.monotonic() + time_s
 

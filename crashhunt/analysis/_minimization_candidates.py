@@ -116,12 +116,6 @@ class Minimizer:
         form: Whether the other actors drive; with ``either``, they drive if few of them remain.
         constructor_defaults: The defaults in the agents' own code, by agent and name. The defaults in the code take
             precedence over the defaults of the scenario, because the user sees them where the agent is fixed.
-
-    Attributes:
-        best: the smallest candidate that crashed in the same manner.
-        smaller: the minimized candidates that still crash, in the order in which they were found.
-        reproduced: whether the original crash itself reproduced.
-        notes: notes on stages that were not possible, as text.
     """
 
     def __init__(
@@ -131,10 +125,11 @@ class Minimizer:
         form: Form,
         constructor_defaults: Mapping[tuple[str, str], Value] = MappingProxyType({}),
     ) -> None:
-        self.best = rerun.spec
+        self.best = rerun.spec  # the smallest candidate that crashed in the same manner
+        # the minimized candidates that still crash, in the order in which they were found
         self.smaller: list[TrialSpec] = []
-        self.reproduced = False
-        self.notes: list[str] = []
+        self.reproduced = False  # whether the original crash itself reproduced
+        self.notes: list[str] = []  # notes on stages that were not possible, as text
         self._rerun, self._runs, self._form = rerun, runs, form
         self._everybody: tuple[str, ...] = ()
         self._left_out = True

@@ -140,16 +140,11 @@ class NoProcessError(CannotForkError):
 
 
 class Watchdog:
-    """Writes the traceback of a process after a time limit. The thread of the watchdog is stopped during a fork.
-
-    Attributes:
-        file: the file to which the traceback is written; None while no time limit is set.
-        threads: ids of the watchdog's own threads.
-    """
+    """Writes the traceback of a process after a time limit. The thread of the watchdog is stopped during a fork."""
 
     def __init__(self) -> None:
-        self.file: TextIO | None = None
-        self.threads: frozenset[str] = frozenset()
+        self.file: TextIO | None = None  # the file to which the traceback is written; None while no time limit is set
+        self.threads: frozenset[str] = frozenset()  # ids of the watchdog's own threads
         self._until = 0.0
 
     def arm(self, limit_s: float, file: TextIO) -> None:

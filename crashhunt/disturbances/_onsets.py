@@ -148,11 +148,6 @@ class FirstOnsets:
         after_place: in the first step, disturbances are forced only at later positions in the order than this position.
         stream: numbers that separate the random numbers of the onsets from other random numbers with the same seed.
         places: places of the sampler with the ratios of the forcing; None to create them.
-
-    Attributes:
-        survival: probability that no disturbance has been effective until the present step.
-        masses: probability, by cell, that the first disturbance belongs to the cell and has begun before the present
-            step.
     """
 
     def __init__(
@@ -167,7 +162,8 @@ class FirstOnsets:
         stream: tuple[int, ...] = (),
         places: Sequence[_Place] | None = None,
     ) -> None:
-        self.survival = 1.0
+        self.survival = 1.0  # probability that no disturbance has been effective until the present step
+        # probability, by cell, that the first disturbance belongs to the cell and has begun before the present step
         self.masses: dict[str, float] = {}
         self._sampler, self._forcing, self._seed, self._last = sampler, forcing, seed, last
         self._first, self._after_place, self._stream = first, after_place, stream

@@ -82,9 +82,6 @@ class Brancher(Observer):
         crash_on: The outcomes that count as a crash.
         delay: Function called with the wall time that branches have taken, in s.
         tell: Function called with texts for the user.
-
-    Attributes:
-        fork_runner: Object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -99,7 +96,7 @@ class Brancher(Observer):
         self._words = tuple(words)
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.fork_runner = ForkRunner("branches", tell)
+        self.fork_runner = ForkRunner("branches", tell)  # object that runs the forks, and counts those without a result
         self._branches = Branches()
         self._asleep: deque[_StoredFork] = deque()
         self._disturber: DisturbanceSampler | None = None

@@ -95,23 +95,10 @@ class Episode(Forkable, Ending):
         observers: Observers of the episode, called in this order.
         forks: Whether the episode may be forked; it then records the open files before the agents are created.
         reset: function that resets the simulator; None for the simulator's own `reset`.
-
-    Attributes:
-        spec: specification of the trial.
-        simulator: the simulator in which the trial runs.
-        names: names of all actors, in the order of their numbers; empty before the start.
-        agents: agents by name. An agent that is replaced between two steps acts from the next step on.
-        acting: the numbers of the agents that act in the next step.
-        steps: number of completed steps.
-        result: The result; None while the episode runs.
-        error: the exception that ended the episode, until `close`; None if there was none.
-        setup_s: wall time that `start` took, in s.
-        setup_steps: number of simulated steps before the first step of the trial; None if the simulator does not report
-            it.
-        live: x, y, heading and speed of the only agent while the requirements read a step whose scene is not made;
-            otherwise None.
     """
 
+    # x, y, heading and speed of the only agent while the requirements read a step whose scene is not made; otherwise
+    # None
     live: tuple[float, float, float, float] | None = None
 
     def __init__(
@@ -127,15 +114,18 @@ class Episode(Forkable, Ending):
         reset: Reset | None = None,
     ) -> None:
         super().__init__()
-        self.spec = spec
-        self.simulator = simulator
-        self.names: tuple[str, ...] = ()
+        self.spec = spec  # specification of the trial
+        self.simulator = simulator  # the simulator in which the trial runs
+        self.names: tuple[str, ...] = ()  # names of all actors, in the order of their numbers; empty before the start
+        # agents by name. An agent that is replaced between two steps acts from the next step on.
         self.agents: dict[str, Agent] = {}
-        self.acting: tuple[int, ...] = ()
-        self.steps = 0
-        self.result: TrialResult | None = None
+        self.acting: tuple[int, ...] = ()  # the numbers of the agents that act in the next step
+        self.steps = 0  # number of completed steps
+        self.result: TrialResult | None = None  # the result; None while the episode runs
+        # the exception that ended the episode, until `close`; None if there was none
         self.error: BaseException | None = None
-        self.setup_s = 0.0
+        self.setup_s = 0.0  # wall time that `start` took, in s
+        # number of simulated steps before the first step of the trial; None if the simulator does not report it
         self.setup_steps: int | None = None
         self._observations: Observations = {}
         self._rewards: Mapping[str, float] = {}

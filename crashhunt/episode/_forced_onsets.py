@@ -50,9 +50,6 @@ class OnsetForcer:
         patience_s: time limit of a copy, in s of wall time.
         delay: function called with the wall time that copies have taken, in s.
         tell: function called with texts for the user.
-
-    Attributes:
-        fork_runner: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -67,7 +64,7 @@ class OnsetForcer:
         self._crashes = frozenset(map(str, crash_on))
         self._patience_s = patience_s
         self._delay = delay
-        self.fork_runner = ForkRunner("rare", tell)
+        self.fork_runner = ForkRunner("rare", tell)  # object that runs the forks, and counts those without a result
         self._sampler: DisturbanceSampler | None = None
         self._onsets: FirstOnsets | None = None
         self._copies: list[ForcedCopy] = []

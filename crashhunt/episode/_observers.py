@@ -273,14 +273,11 @@ class Recorder(Observer):
     Args:
         box: the black box, for which `BlackBox.begin` has been called.
         simulator: the simulator of the episode.
-
-    Attributes:
-        numbers: the numbers of the actors that are recorded.
     """
 
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:
         self._box = box
-        self.numbers: dict[Actor, int] = {}
+        self.numbers: dict[Actor, int] = {}  # the numbers of the actors that are recorded
         self._same: dict[int, int] = {}
         self._kept: list[Actor] = []
         # Without detection of events, a count of 0 would be misleading.

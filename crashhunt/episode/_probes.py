@@ -119,9 +119,6 @@ class Prober:
         budget: maximum number of steps of forks for each step of their trial.
         tell: function called with texts for the user.
         refused: kinds of disturbances that do not fit the actions of an agent, by identifier of the agent.
-
-    Attributes:
-        fork_runner: object that runs the forks, and counts those without a result.
     """
 
     def __init__(
@@ -137,7 +134,7 @@ class Prober:
         self._budget = budget
         self._crashes = frozenset(map(str, crash_on))
         self._delay = delay
-        self.fork_runner = ForkRunner("probes", tell)
+        self.fork_runner = ForkRunner("probes", tell)  # object that runs the forks, and counts those without a result
         self._stress = Stress(1.0)
         self._moment = 0  # of those at which there was something to ask
         self._goes_on = False  # without any disturbance, from the present moment on: that is asked once

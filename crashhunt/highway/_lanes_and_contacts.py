@@ -115,9 +115,6 @@ class VehicleFilter:
         agents: Identifiers of the agents, which stay as well.
         things: Function that returns all vehicles and obstacles.
         actor_of: Function that returns the actor of an object.
-
-    Attributes:
-        entered: Identifiers of all objects that have entered, in order, without the agents.
     """
 
     def __init__(
@@ -131,7 +128,7 @@ class VehicleFilter:
         self._road, self._things, self._actor_of = road, things, actor_of
         self._agents = frozenset(agents)
         self._takes_part = frozenset(takes_part) | self._agents
-        self.entered: list[str] = []
+        self.entered: list[str] = []  # identifiers of all objects that have entered, in order, without the agents
         self._seen: set[str] = set()
 
     def remove(self) -> bool:

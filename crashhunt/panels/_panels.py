@@ -319,18 +319,14 @@ class Canvas:
         width: width of the panel, in pixels.
         height: height of the panel, in pixels.
         title: title above the panel.
-
-    Attributes:
-        image: image on which the panel is drawn.
-        draw: Pillow's object that draws on the image.
     """
 
     def __init__(self, width: int, height: int, title: str) -> None:
         from PIL import ImageDraw
 
         self.width, self.height = width, height
-        self.image = _background(width, height, _one_line(title)).copy()
-        self.draw = ImageDraw.Draw(self.image)
+        self.image = _background(width, height, _one_line(title)).copy()  # image on which the panel is drawn
+        self.draw = ImageDraw.Draw(self.image)  # Pillow's object that draws on the image
 
     def text(
         self, at: tuple[float, float], text: str, color: tuple[int, int, int], size: int, anchor: str = "la"

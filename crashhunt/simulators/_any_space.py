@@ -37,22 +37,18 @@ class ObservationForm:
     An observation is recorded unchanged if its space is an array. Observations of a Dict or Tuple space of arrays are
     flattened, if flattening loses no information. Any other observation is recorded as the text of its value
     (`encode_value`).
-
-    Attributes:
-        original: The environment's observation space.
-        space: The space of the arrays.
-        structured: Whether agents receive another object than the array; call `restore` to get this object.
     """
 
     def __init__(self, space: Space[Any]) -> None:
-        self.original = space
+        self.original = space  # the environment's observation space
         self._values: _Values | None = None
         self.flattened = False
-        self.space: Space[Any] = space
+        self.space: Space[Any] = space  # the space of the arrays
         if not _is_array(space):
             self.flattened = _flattens_exactly(space)
             self.space = spaces.flatten_space(space) if self.flattened else OpaqueSpace(space)
             self._values = None if self.flattened else _Values()
+        # whether agents receive another object than the array; call `restore` to get this object
         self.structured = self.space is not space
         self._dtype = np.dtype(self.space.dtype)
 

@@ -49,15 +49,11 @@ class LanePlace:
 
 
 class SceneObserver:
-    """Builds the observations of all agents that observe parts.
-
-    Attributes:
-        layouts: The layout of each such agent's observation.
-        hidden: Pairs of identifiers: an agent, and an actor that this agent does not see.
-    """
+    """Builds the observations of all agents that observe parts."""
 
     def __init__(self, setups: Mapping[str, AgentSetup], others: Iterable[str] = ()) -> None:
-        self.layouts = layouts_of(setups, (*SCENE_PARTS, *others))
+        self.layouts = layouts_of(setups, (*SCENE_PARTS, *others))  # the layout of each such agent's observation
+        # pairs of identifiers: an agent, and an actor that this agent does not see
         self.hidden: set[tuple[str, str]] = set()
         self._step_length_s = self._start_s = 0.0
         self._seed = 0

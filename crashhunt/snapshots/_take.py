@@ -53,20 +53,14 @@ _GENERATED_FOLDERS = {"__pycache__", ".git", ".hg", ".venv", ".mypy_cache", ".ru
 
 @dataclass(slots=True)
 class Sources:
-    """Files of code, and their places in a snapshot.
+    """Files of code, and their places in a snapshot."""
 
-    Attributes:
-        files: The source file for each place in the snapshot (``code/…``).
-        paths: The folders of the snapshot from which modules are imported, in the order of ``sys.path``.
-        trees: The git work trees that are part of the snapshot.
-        excluded: The files that were not taken, each with the reason.
-        origins: The original folder of each folder of the snapshot that is the copy of one; ``code`` may have several.
-    """
-
-    files: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)  # the source file for each place in the snapshot (``code/…``)
+    # the folders of the snapshot from which modules are imported, in the order of ``sys.path``
     paths: list[str] = field(default_factory=lambda: [layout.CODE])
-    trees: list[Path] = field(default_factory=list)
-    excluded: list[str] = field(default_factory=list)
+    trees: list[Path] = field(default_factory=list)  # the git work trees that are part of the snapshot
+    excluded: list[str] = field(default_factory=list)  # the files that were not taken, each with the reason
+    # the original folder of each folder of the snapshot that is the copy of one; ``code`` may have several
     origins: list[tuple[str, str]] = field(default_factory=list)
 
 

@@ -200,9 +200,6 @@ class PairedHunts:
         pairs: maximum number of trials of each hunt.
         counts: function that returns whether a crash counts, from the directory of its hunt and the number of its
             trial; by default, every crash counts.
-
-    Attributes:
-        trained_on: number of pairs that do not count, because an agent was trained on their traffic.
     """
 
     def __init__(
@@ -210,7 +207,7 @@ class PairedHunts:
     ) -> None:
         self._counts = counts
         self.name, self.folders, self.most = name, (base, head), pairs
-        self.trained_on = 0
+        self.trained_on = 0  # number of pairs that do not count, because an agent was trained on their traffic
         self._held_out: HeldOutTraffics | None = None
         self._sequence: PairSequence | None = None
         self._crash_on: tuple[str, ...] = ()

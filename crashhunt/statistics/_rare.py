@@ -306,18 +306,13 @@ def learn_forcing(earlier: Iterable[Forced], start: Forcing) -> Forcing:
 
 
 class _Learned:
-    """The statistics of the copies of earlier roots, by the cell of their first disturbance.
-
-    Attributes:
-        masses: probability of the first disturbance, summed over roots.
-        copies: number of copies of earlier roots.
-        squares: sum of the squared crash probabilities that the copies estimate. Each probability is conditional on the
-            first disturbance, and is estimated from one copy and the copies forked from this copy.
-    """
+    """The statistics of the copies of earlier roots, by the cell of their first disturbance."""
 
     def __init__(self) -> None:
-        self.masses: Counter[str] = Counter()
-        self.copies: Counter[str] = Counter()
+        self.masses: Counter[str] = Counter()  # probability of the first disturbance, summed over roots
+        self.copies: Counter[str] = Counter()  # number of copies of earlier roots
+        # sum of the squared crash probabilities that the copies estimate. Each probability is conditional on the first
+        # disturbance, and is estimated from one copy and the copies forked from this copy.
         self.squares: defaultdict[str, float] = defaultdict(float)
         self._values: defaultdict[str, float] = defaultdict(float)
         # Of copies that could have a second onset, and on which these were forced: their number, and the crash

@@ -373,17 +373,13 @@ class RareWatch:
     """Reads trials in the order of their numbers, and finds the block after which the hunt may end.
 
     A root counts after its plain trials have ended as well.
-
-    Attributes:
-        weightiest: the greatest weights of roots with a crashed copy, in descending order.
-        is_met: whether the interval is narrow enough; no further trial is then read.
-        is_replanned: whether TRIALS was changed after results were known.
     """
 
     def __init__(self, settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler) -> None:
+        # the greatest weights of roots with a crashed copy, in descending order
         self.weightiest: list[TrialResult] = []
-        self.is_met = False
-        self.is_replanned = False
+        self.is_met = False  # whether the interval is narrow enough; no further trial is then read
+        self.is_replanned = False  # whether TRIALS was changed after results were known
         self._settings, self._ledger = settings, ledger
         self._hazard = len(sampler.agents) * math.fsum(sampler.chance(name) for name in sampler.models)
         self._counter = RareCounter(min(1.0, self._hazard * settings.max_steps))

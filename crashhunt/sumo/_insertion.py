@@ -158,16 +158,13 @@ class VehicleFilter:
     Args:
         takes_part: Identifiers of the actors that stay, as in scenes.
         leaving: Collection to which the SUMO ids of removed persons are added, because scenes must hide them.
-
-    Attributes:
-        entered: Identifiers of all actors that have entered, in order.
     """
 
     def __init__(self, takes_part: Iterable[str], leaving: set[str]) -> None:
         self._takes_part = frozenset(takes_part)
         self._all_take_part = ALL_AGENTS in self._takes_part
         self._leaving = leaving
-        self.entered: list[str] = []
+        self.entered: list[str] = []  # identifiers of all actors that have entered, in order
 
     def remove(self) -> None:
         """Remove the excluded actors that entered in the last step."""

@@ -75,20 +75,13 @@ class GraphLane:
 
 
 class LaneGraph:
-    """The lanes of a network, including those inside junctions.
-
-    Attributes:
-        is_left_hand: whether traffic drives on the left.
-        rules: the rules of the junctions, by id.
-        lanes: the lanes by id.
-        edges: the lanes of each edge, by id of the edge.
-    """
+    """The lanes of a network, including those inside junctions."""
 
     def __init__(self, network: RoadNetwork) -> None:
-        self.is_left_hand = network.left_hand
-        self.rules = network.rules
-        self.lanes: dict[str, GraphLane] = {}
-        self.edges: dict[str, list[GraphLane]] = {}
+        self.is_left_hand = network.left_hand  # whether traffic drives on the left
+        self.rules = network.rules  # the rules of the junctions, by id
+        self.lanes: dict[str, GraphLane] = {}  # the lanes by id
+        self.edges: dict[str, list[GraphLane]] = {}  # the lanes of each edge, by id of the edge
         self._ends = {edge.id: edge.ends for edge in network.edges.values()}
         self._between: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
         for name, ends in self._ends.items():

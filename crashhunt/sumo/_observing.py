@@ -78,16 +78,12 @@ class ObservedParts:
     Args:
         scenario: The scenario.
         core: The compiled core; None if it is not used.
-
-    Attributes:
-        core: The compiled core, which `begin` gives to the readers; None if it is not used.
-        layouts: The layout of each such agent's observation.
-        reach_m: Largest distance at which a part shows actors, in m; 0 if no part shows actors.
     """
 
     def __init__(self, scenario: Scenario, core: Core | None = None) -> None:
-        self.core = core
-        self.layouts = layouts_of(scenario.agents, READERS)
+        self.core = core  # the compiled core, which `begin` gives to the readers; None if it is not used
+        self.layouts = layouts_of(scenario.agents, READERS)  # the layout of each such agent's observation
+        # largest distance at which a part shows actors, in m; 0 if no part shows actors
         self.reach_m = max((layout.reach_m for layout in self.layouts.values()), default=0.0)
         self._step_length_s = scenario.step_length_s
         self._scenario = scenario

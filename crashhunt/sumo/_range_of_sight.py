@@ -56,9 +56,6 @@ class Sight:
         speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
         core: The compiled core, which reads faster; None if it is not available.
         reach_m: Distance within which each scene must contain all actors, in m; 0 for the usual distance.
-
-    Attributes:
-        leaving: SUMO ids of persons that SUMO still has, but that scenes must hide.
     """
 
     def __init__(
@@ -79,7 +76,7 @@ class Sight:
             before_it_enters_s = (SIGHT_M - _CENTER_OFFSETS_M - reach_m) / _MAX_CLOSING_SPEED_MPS
             self._every = max(1, min(self._every, int(before_it_enters_s / step_length_s)))
         self._speeds = speeds
-        self.leaving: set[str] = set()
+        self.leaving: set[str] = set()  # SUMO ids of persons that SUMO still has, but that scenes must hide
         self._high: bool | None = None
         self._bends = Bends(lateral=lateral)
         self._known: dict[str, Actor] = {}

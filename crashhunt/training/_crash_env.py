@@ -131,9 +131,6 @@ class CrashEnv(gymnasium.Env[Any, Any]):
             only one simulation of SUMO.
         render_mode: Only None is allowed.
 
-    Attributes:
-        crashes: Names of the crashes of the training part.
-
     Raises:
         UsageError: An option is out of range, no crash is in the training part, or the crashes' scenarios or spaces
             differ.
@@ -188,7 +185,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         self.observation_space = self._episodes.observation_space
         self.action_space = self._episodes.action_space
         self.render_mode = None
-        self.crashes = tuple(crash.name for crash in self._training)
+        self.crashes = tuple(crash.name for crash in self._training)  # names of the crashes of the training part
         self._replay = CrashReplay(len(self._training))
         self._index: int | None = None
         if record is not None:

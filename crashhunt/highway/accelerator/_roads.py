@@ -146,17 +146,13 @@ def prepared(road: Road) -> Prepared | None:
 
 
 class _RoadKind:
-    """Properties of a class of roads.
-
-    Attributes:
-        is_seen: Whether the accelerator may search the road's vehicles and objects.
-        is_known: Whether, in addition, the class overrides no method that the accelerator bypasses.
-    """
+    """Properties of a class of roads."""
 
     def __init__(self, kind: type[Road]) -> None:
         base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
         self.own = Own(kind, base, _READ_ATTRIBUTES)
-        self.is_seen = self.own.plain
+        self.is_seen = self.own.plain  # whether the accelerator may search the road's vehicles and objects
+        # whether, in addition, the class overrides no method that the accelerator bypasses
         self.is_known = self.own.plain and not any(map(self.own.has, _BYPASSED_METHODS))
 
 
