@@ -306,12 +306,7 @@ def run_alone(
 
 
 class SharedReruns:
-    """Reruns for several threads, each of which waits for its own trial; trials with equal settings share processes.
-
-    Args:
-        scratch: folder for the files of the runs.
-        parallel: number of trials at a time.
-    """
+    """Reruns for several threads, each of which waits for its own trial; trials with equal settings share processes."""
 
     def __init__(self, scratch: Path, *, parallel: int) -> None:
         self._scratch, self._parallel = scratch, parallel

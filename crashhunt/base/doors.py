@@ -23,11 +23,7 @@ _IMPORT = re.compile(r"^ {4}from (\S+) import (?:\(([^)]*)\)|(.*))$", re.MULTILI
 
 
 def offer_lazily(package: str) -> None:
-    """Have a package import the names below its ``if TYPE_CHECKING`` when they are used for the first time.
-
-    Args:
-        package: name of the package, whose ``__init__`` is being executed.
-    """
+    """Have a package import the names below its ``if TYPE_CHECKING`` when they are used for the first time."""
     namespace = vars(sys.modules[package])
     block = _BLOCK.search(Path(namespace["__file__"]).read_text(encoding="utf-8"))
     homes = {

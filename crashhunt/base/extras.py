@@ -17,9 +17,6 @@ def install_command(extra: str) -> str:
 
     A clone of the repository is installed in place, and ``scripts/crashhunt`` has its own environment, whose pip is
     not on the PATH. In these cases, the command names the pip of the environment and the folder of the clone.
-
-    Args:
-        extra: name of the extra in ``pyproject.toml``.
     """
     programs, root = Path(sys.prefix, "bin"), layout.PACKAGE.parent
     found = shutil.which("pip")

@@ -291,11 +291,7 @@ class Copy:
             os.close(theirs)
 
     def answer(self, timeout_s: float = math.inf) -> Plain | None:
-        """Wait for the answer, then end the fork; return None if the work failed, died or exceeded the time limit.
-
-        Args:
-            timeout_s: maximum wall time, in s.
-        """
+        """Wait for the answer, then end the fork; return None if the work failed, died or exceeded the time limit."""
         received, deadline = bytearray(), time.monotonic() + timeout_s
         try:
             while not received.endswith(b"\n"):
@@ -531,12 +527,7 @@ class SuspendedFork:
             os.close(answers)
 
     def ask(self, job: Plain, timeout_s: float) -> Plain | None:
-        """Return the answer to a job; None if the work failed, died or exceeded the time limit (see `no_answer`).
-
-        Args:
-            job: the input of the function.
-            timeout_s: maximum wall time, in s.
-        """
+        """Return the answer to a job; None if the work failed, died or exceeded the time limit (see `no_answer`)."""
         if not self.is_usable:
             return None
         children = children_now()

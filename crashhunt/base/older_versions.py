@@ -35,11 +35,7 @@ _REMOVED = {
 
 
 def removed_fix(name: str) -> str:
-    """Return the instruction for an option of an earlier version; empty if there was no such option.
-
-    Args:
-        name: option as on the command line, or the key of a file, or the argument of a function.
-    """
+    """Return the instruction for an option of an earlier version; empty if there was no such option."""
     return _REMOVED.get("--" + name.removeprefix("--").replace("_", "-"), "")
 
 

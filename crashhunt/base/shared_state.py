@@ -55,9 +55,6 @@ class _Mapping:
 class SharedState:
     """The files and memory that this process shares with its forks. Each fork first calls `separate`.
 
-    Args:
-        known: file descriptors that stay open.
-
     Attributes:
         remaining: description of a file that is too large to copy, or of a pipe or socket; empty if there is none.
     """

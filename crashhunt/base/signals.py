@@ -64,9 +64,6 @@ def interrupted_after(seconds: float) -> Iterator[None]:
 
     In a thread that is not the main thread, signal handlers cannot be set, so the code is not interrupted.
 
-    Args:
-        seconds: wall time after which the code is interrupted; once a second from then on.
-
     Raises:
         InterruptedCodeError: the code did not end in time.
     """

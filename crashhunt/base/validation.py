@@ -156,13 +156,7 @@ def _keys_to(found: ErrorDetails, data: object) -> tuple[str, ...]:
 
 
 def _in_terms_of_toml(found: ErrorDetails, key: str, of_members: Sequence[ErrorDetails]) -> tuple[str, str]:
-    """Return the message and the fix of an error without Python's names of types.
-
-    Args:
-        found: the error.
-        key: the key whose value is wrong.
-        of_members: the errors of the same value; each member of a union has its own.
-    """
+    """Return the message and the fix of an error without Python's names of types."""
     if found["type"] == "tuple_type" and isinstance(found["input"], dict):
         return "a table where a list of tables is needed", f"write [[{key}]] above each table"
     if found["type"] == "tuple_type":

@@ -76,13 +76,6 @@ class _Overruling:
 class Braking(_Overruling):
     """Lets an agent drive up to a step. After this step, the vehicle brakes as hard as it can, or changes lanes.
 
-    Args:
-        driver: the agent that drives up to the step.
-        simulator: the simulator, which provides the action for full braking.
-        agent: identifier of the controlled vehicle.
-        after: the step after which the vehicle brakes.
-        manoeuvre: name of the manoeuvre, as in `Overruled`.
-
     Raises:
         InvalidEpisodeError: the simulator has no action for this manoeuvre.
     """
@@ -106,13 +99,6 @@ class Braking(_Overruling):
 
 class Keeping(_Overruling):
     """Lets an agent drive, and after a step prevents lane changes or speed changes of its vehicle.
-
-    Args:
-        driver: the agent that drives.
-        simulator: the simulator, which reports the speed of the vehicle.
-        agent: identifier of the controlled vehicle.
-        after: the step after which lane or speed are kept.
-        keeps: what the vehicle keeps: ``lane`` prevents lane changes, ``speed`` holds the speed.
 
     Raises:
         InvalidEpisodeError: The action form has no known lanes and speeds.

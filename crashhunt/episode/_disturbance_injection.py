@@ -265,12 +265,7 @@ class DisturbanceInjector:
 
 
 class _Late:
-    """Delays a value: returns the value of an earlier step; before that, a value derived from the first value.
-
-    Args:
-        delay: The delay, in steps.
-        held: Function that returns the value for the first steps, given the first value.
-    """
+    """Delays a value: returns the value of an earlier step; before that, a value derived from the first value."""
 
     def __init__(self, delay: int, held: Callable[[Array], Array] = lambda first: first) -> None:
         self._delay = delay
@@ -286,12 +281,7 @@ class _Late:
 
 
 class _Held:
-    """Returns the action of a vehicle that receives no decision: it keeps the speed and the lane.
-
-    Args:
-        form: The vehicle's action form.
-        before: The action of the previous step; None at the beginning.
-    """
+    """Returns the action of a vehicle that receives no decision: it keeps the speed and the lane."""
 
     def __init__(self, form: ActionForm, before: Array | None) -> None:
         self._form = form
@@ -364,15 +354,7 @@ def _center_of(simulator: Simulator, agent: str) -> tuple[float, float] | None:
 
 
 class _Noisy:
-    """Adds to every number an error of up to a share of the number, within the bounds of the space.
-
-    Args:
-        share: The largest relative error.
-        names: The names of the columns, if known; directions, presence and class are not changed.
-        low: The lower bound of each number.
-        high: The upper bound of each number.
-        rng: The random generator of the disturbance.
-    """
+    """Adds to every number an error of up to a share of the number, within the bounds of the space."""
 
     def __init__(self, share: float, names: Sequence[str], low: Array, high: Array, rng: np.random.Generator) -> None:
         self._share = share

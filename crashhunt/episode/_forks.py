@@ -31,10 +31,6 @@ class ForkRunner:
     three consecutive forks without a result, no more forks run. The limit applies to the trial if the cause was
     outside, and to the process if forks failed by themselves.
 
-    Args:
-        what: name of the forks in the plural, such as ``probes``.
-        tell: function called with texts for the user.
-
     Attributes:
         what: name of the forks in the plural, as given to the constructor.
         why_not: why this process runs no more forks, as text; empty if it still runs forks.

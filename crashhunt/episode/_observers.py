@@ -269,10 +269,6 @@ class Recorder(Observer):
     """Observer that records an episode; it adds the digest and the number of traffic events to the result.
 
     The recorder is the first observer, because a step is complete only after it is recorded.
-
-    Args:
-        box: the black box, for which `BlackBox.begin` has been called.
-        simulator: the simulator of the episode.
     """
 
     def __init__(self, box: BlackBox, simulator: Simulator) -> None:

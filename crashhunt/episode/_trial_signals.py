@@ -110,11 +110,7 @@ class SignalledEpisode(Protocol):
 
 
 class TrialSignals:
-    """Reads the signals of a running episode.
-
-    Args:
-        episode: the episode, whose simulator has been reset.
-    """
+    """Reads the signals of a running episode."""
 
     def __init__(self, episode: SignalledEpisode) -> None:
         self._episode = episode

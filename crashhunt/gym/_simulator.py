@@ -114,10 +114,6 @@ class GymSimulator:
     crash rule holds, the step has a collision without a collision partner. An episode that ends without a crash has
     finished, also by the environment's own time limit. The environment has the wrappers with which it is registered.
 
-    Args:
-        scenario: The scenario to run.
-        stage: Ignored; other simulators need this argument.
-
     Raises:
         ScenarioError: The environment or the crash rule does not exist.
     """

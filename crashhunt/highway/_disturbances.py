@@ -74,11 +74,6 @@ def lanes_ahead(
     """Yield a vehicle's lane and the lanes after it, up to a fork for which the vehicle has no route.
 
     At such a fork, `RoadNetwork.next_lane` would draw a lane at random and change the simulation.
-
-    Args:
-        network: network of roads.
-        vehicle: the vehicle, with its planned route if it has one.
-        index: index of the first lane; None for the lane of the vehicle.
     """
     start, end, number = index or vehicle.lane_index
     # Only a ControlledVehicle has a planned route.

@@ -108,13 +108,6 @@ class VehicleFilter:
 
     Objects get their names in the order in which they enter, whether they stay or not. An environment that adds
     vehicles during an episode may add different vehicles when some are missing.
-
-    Args:
-        road: The road of the environment.
-        takes_part: Identifiers of the objects that stay, as in scenes.
-        agents: Identifiers of the agents, which stay as well.
-        things: Function that returns all vehicles and obstacles.
-        actor_of: Function that returns the actor of an object.
     """
 
     def __init__(
@@ -151,13 +144,7 @@ class VehicleFilter:
 
 
 class Hidden:
-    """Hides a vehicle from one agent: removes it from the road while the agent's observation is made.
-
-    Args:
-        road: The road of the episode.
-        seeing: The agent's observation type; every observation type of highway-env reads the vehicles of the road.
-        vehicle: The vehicle that the agent does not see.
-    """
+    """Hides a vehicle from one agent: removes it from the road while the agent's observation is made."""
 
     how_strong = 1.0
 
@@ -190,13 +177,7 @@ class Hidden:
 
 
 class HighwayEvents:
-    """Detects traffic events of the controlled vehicles in one episode.
-
-    Args:
-        step_length_s: Step length, in s.
-        events: `Scenario.events`, with the limit for a standstill.
-        lanes_are_road: Whether lanes have a driving direction; parking bays have none.
-    """
+    """Detects traffic events of the controlled vehicles in one episode."""
 
     def __init__(self, step_length_s: float, events: Mapping[str, float], *, lanes_are_road: bool) -> None:
         self._standstill = Standstill(step_length_s, events)

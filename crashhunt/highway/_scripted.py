@@ -27,12 +27,6 @@ class Puppet(Vehicle):  # type: ignore[misc]
     """A vehicle that follows a recorded path.
 
     After each step the state is bit-identical to the recorded state. Between two steps it is interpolated linearly.
-
-    Args:
-        road: The road of the environment.
-        path: The recorded path; after its end, the vehicle drives straight on.
-        sub_steps: Number of sub-steps in each step.
-        step_length_s: Step length, in s.
     """
 
     impact: NDArray[np.float64] | None

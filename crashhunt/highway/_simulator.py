@@ -88,10 +88,6 @@ class HighwaySimulator:
     A control step is a step of the policy. An episode ends after ``max_steps``, the ``duration`` of the configuration,
     or the registered ``max_episode_steps``. A terminated agent idles until the episode ends.
 
-    Args:
-        scenario: The scenario to run.
-        stage: Ignored; other simulators need this argument.
-
     Raises:
         ScenarioError: The environment or an entry of its configuration does not exist, or it has too few vehicles.
     """

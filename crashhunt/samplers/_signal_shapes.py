@@ -73,12 +73,7 @@ class SignalShapes:
         return found
 
     def changed(self, points: Floats, rng: np.random.Generator) -> Floats:
-        """Return points, each with changes of one signal or of several.
-
-        Args:
-            points: points x dimensions.
-            rng: source of the changes.
-        """
+        """Return points, each with changes of one signal or of several."""
         found, active = points.copy(), np.arange(len(points))
         while len(active):
             found[active] = self._changed_once(found[active], rng)

@@ -343,13 +343,7 @@ _ACTOR, _OWN = (125, 139, 156), (224, 138, 0)
 
 
 class Raster:
-    """Cells around a vehicle: the vehicle is in the middle, and its heading points to smaller row numbers.
-
-    Args:
-        rows: Number of cells along the heading.
-        columns: Number of cells across the heading.
-        resolution_m: Edge length of a cell, in m.
-    """
+    """Cells around a vehicle: the vehicle is in the middle, and its heading points to smaller row numbers."""
 
     def __init__(self, rows: int, columns: int, resolution_m: float) -> None:
         self._shape, self._resolution_m = (rows, columns), resolution_m

@@ -48,10 +48,6 @@ class ToySimulator:
     - ``fail_reset``: true makes `reset` fail on purpose.
     - ``fail_at_step``, ``exit_at_step``, ``segfault_at_step``, ``hang_at_step``: number of the step that fails on
       purpose.
-
-    Args:
-        scenario: Scenario whose agents and step length are used.
-        stage: Ignored; other simulators need this argument.
     """
 
     def __init__(self, scenario: Scenario, stage: Path) -> None:

@@ -69,9 +69,6 @@ class Snapshot:
     A snapshot has the folders ``code/``, ``scenario/`` and ``files/``, which contains the files that arguments name.
     The file ``manifest.json`` contains the size and hash of each file. The files ``hunt.toml``, ``environment.json``
     and ``git.diff`` describe the snapshot.
-
-    Args:
-        path: The folder of the snapshot, whose name is the snapshot's digest.
     """
 
     def __init__(self, path: Path) -> None:

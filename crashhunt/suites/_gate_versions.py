@@ -67,13 +67,7 @@ class GateVersion:
 
 
 class WorkTrees:
-    """The temporary work trees of two commits. There are none if the versions are agents.
-
-    Args:
-        folder: folder of the user, in the repository that contains the commits.
-        versions: the versions by side, such as ``base``.
-        stack: the work trees are removed when it closes.
-    """
+    """The temporary work trees of two commits. There are none if the versions are agents."""
 
     def __init__(self, folder: Path, versions: Mapping[str, GateVersion], stack: ExitStack) -> None:
         self._folder, self._versions = folder, versions

@@ -36,9 +36,6 @@ class Bends:
 
     SUMO moves the front and the back of a vehicle along the same lanes. After a lane change, the whole vehicle is in
     the new lane. Therefore a vehicle's centre line follows the lanes from its front backwards along its route.
-
-    Args:
-        lateral: Whether vehicles may leave the centre line of a lane.
     """
 
     def __init__(self, *, lateral: bool) -> None:

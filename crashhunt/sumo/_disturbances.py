@@ -302,11 +302,6 @@ _FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than an
 class SumoDisturbances:
     """Finds the target actors of disturbances, and disturbs them.
 
-    Args:
-        controlled: Identifiers of the agents, which are never a target.
-        step_length_s: Step length of the simulation, in s.
-        driving: `Driving` object, which knows whether traffic drives on the left.
-
     Attributes:
         speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
     """

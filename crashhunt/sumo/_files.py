@@ -252,10 +252,6 @@ class StagedFiles:
     Every file is linked into a private folder of the worker. A file that requests output from SUMO is copied without
     these requests, because two workers would write the same file. In a route or additional file, ``${NAME}`` is
     replaced in every trial.
-
-    Args:
-        scenario: scenario to which the files belong.
-        folder: folder into which the files are staged; it must exist.
     """
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:

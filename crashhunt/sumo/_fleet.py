@@ -28,11 +28,6 @@ class Fleet:
     """Vehicles in SUMO, each alone on a straight road.
 
     Use a fleet as a context, and only one at a time, because libsumo has one simulation.
-
-    Args:
-        speeds: speed of each vehicle at the beginning, in m/s.
-        length_m: length of the vehicles, in m.
-        step_s: step length, in s.
     """
 
     def __init__(self, speeds: Values, *, length_m: float, step_s: float) -> None:
@@ -82,11 +77,7 @@ class Fleet:
         libsumo.close()
 
     def drive(self, accelerations: Values) -> Values:
-        """Simulate one step; return the way that each vehicle has driven in the step, in m.
-
-        Args:
-            accelerations: commanded acceleration of each vehicle, in m/s².
-        """
+        """Simulate one step; return the way that each vehicle has driven in the step, in m."""
         wanted = np.maximum(self.speeds + accelerations * self._step_s, 0.0)
         for place in np.flatnonzero(wanted != self._commanded).tolist():  # SUMO keeps the last command
             sumo.vehicle_setSpeed(self._names[place], float(wanted[place]))

@@ -56,14 +56,7 @@ class Sampling(NamedTuple):
 
 
 class LanePaths:
-    """Makes and keeps the paths of an agent's vehicle.
-
-    Args:
-        graph: the lanes of the network.
-        sampling: how points are sampled.
-        ahead: function that yields the lanes that follow a lane, beginning with this lane.
-        behind: function that yields the lanes before a lane, the nearest first.
-    """
+    """Makes and keeps the paths of an agent's vehicle."""
 
     def __init__(
         self,

@@ -25,12 +25,7 @@ _COLOURS, _OFF = "gyro", 3  # by the state of the part ``signals``
 
 
 class LightReader:
-    """Reads lights and routes in an episode, from its first step on.
-
-    Args:
-        scenario: the scenario.
-        starts: the odometer of every agent's vehicle at the start of the episode, in m.
-    """
+    """Reads lights and routes in an episode, from its first step on."""
 
     def __init__(self, scenario: Scenario, starts: Mapping[str, float]) -> None:
         agents = {name: replace(setup, observation=(_ROUTE, *_PARTS)) for name, setup in scenario.agents.items()}

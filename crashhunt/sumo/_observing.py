@@ -73,12 +73,7 @@ _PARTS_WITH_OBSTACLES = frozenset({"grid", "image", "lidar2d"})
 
 
 class ObservedParts:
-    """Builds the observations of all agents that observe parts.
-
-    Args:
-        scenario: The scenario.
-        core: The compiled core; None if it is not used.
-    """
+    """Builds the observations of all agents that observe parts."""
 
     def __init__(self, scenario: Scenario, core: Core | None = None) -> None:
         self.core = core  # the compiled core, which `begin` gives to the readers; None if it is not used

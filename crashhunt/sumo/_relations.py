@@ -95,14 +95,7 @@ class _Around(NamedTuple):
 
 
 class Relations:
-    """Finds the relation of actors to a vehicle in one episode.
-
-    Args:
-        path: the path of the vehicle.
-        graph: the lanes of the network.
-        conflicts: the conflicts at the junctions.
-        reach_m: how far to follow the lanes of other actors, in m.
-    """
+    """Finds the relation of actors to a vehicle in one episode."""
 
     def __init__(self, path: PathAhead, graph: LaneGraph, conflicts: Conflicts, reach_m: float) -> None:
         self._path, self._graph, self._conflicts, self._reach_m = path, graph, conflicts, reach_m

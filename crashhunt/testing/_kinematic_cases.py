@@ -56,11 +56,7 @@ class Vehicles(Protocol):
 
 
 class KinematicVehicles:
-    """Vehicles whose speed changes by the acceleration; the position changes by the new speed.
-
-    Args:
-        speeds: speed of each vehicle at the beginning, in m/s.
-    """
+    """Vehicles whose speed changes by the acceleration; the position changes by the new speed."""
 
     def __init__(self, speeds: Values) -> None:
         self.speeds = speeds
@@ -230,13 +226,6 @@ _SOLVERS: Mapping[str, Callable[[Columns, str, Vehicles], dict[str, Values]]] = 
 def solve(
     kind: str, cases: Columns, model: str, make: Callable[[Values], Vehicles] = KinematicVehicles
 ) -> dict[str, Values]:
-    """Return the answers of a model to cases of a kind, by the names of their columns.
-
-    Args:
-        kind: ``cut_in``, ``cut_out`` or ``car_following``.
-        cases: the columns of the cases.
-        model: name of the model that drives.
-        make: function that makes the own vehicles from their first speeds.
-    """
+    """Return the answers of a model to cases of a kind, by the names of their columns."""
     with make(cases["ego_kmh"] / _KMH) as vehicles:
         return _SOLVERS[kind](cases, model, vehicles)

@@ -47,11 +47,7 @@ _FORGETTING_RATE = 0.2
 
 
 class CrashReplay:
-    """Draws crashes, with probabilities that depend on how earlier episodes ended.
-
-    Args:
-        count: number of crashes; at least 1.
-    """
+    """Draws crashes, with probabilities that depend on how earlier episodes ended."""
 
     def __init__(self, count: int) -> None:
         self._is_usable = np.ones(count, bool)

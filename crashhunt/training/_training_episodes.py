@@ -198,13 +198,7 @@ class CrashEpisodes:
 
 
 class _Stage:
-    """A hunt whose traffic can be simulated: its simulator, spaces and settings.
-
-    Args:
-        bundle: Bundle of any crash of the hunt.
-        agent: The controlled vehicle of the caller; empty for the first agent.
-        folder: Folder for the files of the simulator.
-    """
+    """A hunt whose traffic can be simulated: its simulator, spaces and settings."""
 
     def __init__(self, bundle: Bundle, agent: str, folder: Path) -> None:
         rerun = prepare(bundle, ReplayOptions(code="current"))

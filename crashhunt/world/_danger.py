@@ -72,12 +72,7 @@ class DangerousMoment(NamedTuple):
 
 
 class DangerMeter:
-    """Measures the criticality of an episode after it has been recorded, many scenes at a time.
-
-    Args:
-        agents: identifiers of the controlled vehicles.
-        step_length_s: step length in s.
-    """
+    """Measures the criticality of an episode after it has been recorded, many scenes at a time."""
 
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
         self._dt = step_length_s

@@ -31,12 +31,7 @@ _ROUNDING_DIGITS = 3  # mm and ms
 
 
 class DrivenMeter:
-    """Measures the distance and the time that agents drive, many scenes at a time.
-
-    Args:
-        agents: identifiers of the controlled vehicles.
-        step_length_s: step length in s.
-    """
+    """Measures the distance and the time that agents drive, many scenes at a time."""
 
     def __init__(self, agents: Sequence[str], step_length_s: float) -> None:
         self.step_length_s = self._dt = step_length_s

@@ -102,12 +102,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class RightOfWay:
-    """The paths across all junctions of a map, and which path must yield to which.
-
-    Args:
-        links: all paths across junctions.
-        gives_way: pairs of indices of ``links``; the first path has to yield to the second path.
-    """
+    """The paths across all junctions of a map, and which path must yield to which."""
 
     links: tuple[Link, ...]
     gives_way: frozenset[tuple[int, int]]

@@ -181,12 +181,7 @@ class LaneLines(NamedTuple):
 
 
 def lane_lines(shape: Sequence[tuple[float, float]], width_m: float) -> LaneLines:
-    """Return the centre line and the two edges of a lane, with points at most `MAX_SPACING_M` apart.
-
-    Args:
-        shape: the centre line, with at least one point, in m.
-        width_m: width of the lane, in m.
-    """
+    """Return the centre line and the two edges of a lane, with points at most `MAX_SPACING_M` apart."""
     center = distinct_points(np.array(shape, float))
     if len(center) == 1:
         center = np.vstack((center, center + np.array((10 * _MIN_SPACING_M, 0.0))))
