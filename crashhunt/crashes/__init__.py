@@ -9,14 +9,14 @@ if TYPE_CHECKING:
     from ._bundle import (
         Bundle as Bundle,
         CrashSummary as CrashSummary,
-        authenticate_bundle as authenticate_bundle,
-        is_bundle_made_here as is_bundle_made_here,
         snapshot_of as snapshot_of,
     )
     from ._bundle_trust import (
         TrustedOrigin as TrustedOrigin,
         add_trusted as add_trusted,
+        authenticate_bundle as authenticate_bundle,
         describe_code as describe_code,
+        is_bundle_made_here as is_bundle_made_here,
         is_bundle_trusted as is_bundle_trusted,
         is_fingerprint_trusted as is_fingerprint_trusted,
         is_hunt_trusted as is_hunt_trusted,

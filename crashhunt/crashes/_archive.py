@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 import json
 import socket
 import stat
@@ -11,16 +12,16 @@ import zipfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import FILES, FileEntry, digest_of_content, parse_object, too_large, typed
+from crashhunt.base.integrity import FILES, FileEntry, digest_of_content, parse_object, too_large, typed, user_key
 from crashhunt.base.progress import Watch, watched
 from crashhunt.base.temporary import temporary_folder
-from crashhunt.crashes._bundle import ArchiveIndex, Bundle, is_bundle_made_here, snapshot_of
-from crashhunt.crashes._bundle_trust import is_made_here, signature
+from crashhunt.crashes._bundle import Bundle, snapshot_of
+from crashhunt.crashes._bundle_trust import is_bundle_made_here
 from crashhunt.crashes._notes import notes_as_text, read_notes, subject_of, user_name
 
 if TYPE_CHECKING:
@@ -32,6 +33,18 @@ _MAX_BYTES = 4 * 10**9  # unpacked size, because a small zip file can contain te
 _MAX_FILES = 100_000  # so many make a file system slow
 _PARTS_OF_A_DESCRIPTION = 3  # snapshots/DIGEST/manifest.json; below are files of any name
 _CHUNK_BYTES = 1 << 20  # bytes at a time, so that a large file needs little memory
+
+
+class ArchiveIndex(TypedDict):
+    """The index of an archive: its version, its origin and its files."""
+
+    schema: int
+    crash: str
+    made_by: str
+    made_at: str
+    files: dict[str, FileEntry]
+    notes: NotRequired[str]
+    signature: NotRequired[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +106,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
         if notes := read_notes(hunt, subject_of(bundle)):  # in the index, because earlier versions refuse further files
             index["notes"] = notes_as_text(notes)
         if is_bundle_made_here(bundle):  # else a stranger's crash would become this user's
-            index["signature"] = signature(index)
+            index["signature"] = _signature(index)
         archive.writestr(zipfile.ZipInfo(layout.ARCHIVE_INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED)
     return target.stat().st_size
 
@@ -126,7 +139,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
             directory=directory,
             made_by=str(index.get("made_by", "?")),
             made_at=str(index.get("made_at", "?")),
-            made_here=is_made_here(index),
+            made_here=_is_made_here(index),
         )
 
 
@@ -200,3 +213,16 @@ def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, directory: Path, 
 
 def _refusal(path: Path, message: str) -> BundleError:
     return BundleError(message, fix="get an undamaged copy from the person who exported it", where=str(path))
+
+
+def _is_made_here(index: ArchiveIndex) -> bool:
+    """Return whether this user has signed an archive on this machine."""
+    said = index.get("signature")
+    return isinstance(said, str) and said.isascii() and hmac.compare_digest(said, _signature(index))
+
+
+def _signature(index: ArchiveIndex) -> str:
+    """Return the signature of an archive, which only this user on this machine can compute."""
+    content = {name: value for name, value in index.items() if name != "signature"}
+    text = json.dumps(content, sort_keys=True, default=str).encode()
+    return hmac.new(user_key(), text, "sha256").hexdigest()

@@ -8,16 +8,9 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.codec import JsonObject, merged
-from crashhunt.base.errors import BundleError, CrashhuntError
+from crashhunt.base.errors import BundleError
 from crashhunt.base.files import whole_file
-from crashhunt.base.integrity import (
-    FileEntry,
-    authentication_code,
-    changed_file,
-    describe_files,
-    digest_of_data,
-    is_authentic,
-)
+from crashhunt.base.integrity import FileEntry, changed_file, describe_files, digest_of_data
 from crashhunt.base.text import command_line
 from crashhunt.snapshots import Snapshot, versions
 
@@ -28,9 +21,6 @@ if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
     from crashhunt.recording import Recording
     from crashhunt.trial import TrialResult, Value
-
-
-# The shapes of a crash for other programs, and of the index of an archive.
 
 
 class CrashSummary(TypedDict):
@@ -51,18 +41,6 @@ class CrashSummary(TypedDict):
     log_likelihood: NotRequired[float | None]
     danger: NotRequired[float | None]
     requirement: NotRequired[str]
-
-
-class ArchiveIndex(TypedDict):
-    """The index of an archive: its version, its origin and its files."""
-
-    schema: int
-    crash: str
-    made_by: str
-    made_at: str
-    files: dict[str, FileEntry]
-    notes: NotRequired[str]
-    signature: NotRequired[str]
 
 
 # The other files of a bundle, next to ``crash.json``, or next to ``params.json`` of a trial kept for another reason.
@@ -250,45 +228,6 @@ class Bundle:
             temporary.write_text(text, encoding="utf-8", errors="surrogatepass")
 
 
-# Who made a bundle: an authentication code shows that this user made it on this machine.
-
-_PURPOSE = "crash bundle"
-
-
 def snapshot_of(bundle: Bundle) -> Snapshot:
     """Return the snapshot of the code that the trial of a bundle ran."""
     return Snapshot(bundle.hunt / layout.SNAPSHOTS / bundle.snapshot)
-
-
-def authenticate_bundle(bundle: Bundle) -> str:
-    """Return the authentication code of a bundle that this process writes; empty if its snapshot is not this user's.
-
-    Without this condition, a crash that was minimized or confirmed in another person's hunt would count as made here.
-    """
-    try:
-        made_here = snapshot_of(bundle).is_made_here
-    except CrashhuntError:  # there is none, as of a candidate of a minimization
-        return ""
-    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
-
-
-def is_bundle_made_here(bundle: Bundle) -> bool:
-    """Return whether this user made a bundle and its snapshot on this machine. The files of the snapshot are not read.
-
-    Raises:
-        BundleError: the manifest of the snapshot is missing or damaged.
-    """
-    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
-
-
-def _statement(bundle: Bundle) -> dict[str, object]:
-    """Return everything in a bundle that determines what runs, and the recording's digest, as text to authenticate."""
-    spec = bundle.result.spec.to_json()
-    return {
-        **{name: spec[name] for name in ("number", "seed", "max_steps", "arguments", "scenario_arguments")},
-        "disturbances": spec.get("disturbances") or [],
-        "only": spec.get("only"),
-        "script": spec.get("script"),
-        "digest": bundle.result.digest,
-        "snapshot": bundle.snapshot,
-    }

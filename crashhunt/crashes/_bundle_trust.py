@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import hmac
 import json
 import os
 import time
@@ -17,10 +16,10 @@ from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.files import whole_file
 from crashhunt.base.git import git_directory, tracked_files, work_tree
-from crashhunt.base.integrity import parse_object, state_folders, user_key
+from crashhunt.base.integrity import authentication_code, is_authentic, parse_object, state_folders
 from crashhunt.base.plugins import Group, registered
 from crashhunt.base.text import command_line
-from crashhunt.crashes._bundle import ArchiveIndex, Bundle, is_bundle_made_here, snapshot_of
+from crashhunt.crashes._bundle import Bundle, snapshot_of
 from crashhunt.oracles import oracle_name
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.scenario import backend_of
@@ -148,6 +147,48 @@ def remove_trusted(names: Sequence[str]) -> list[TrustedOrigin]:
 
 def _folders() -> list[Path]:
     return [folder / _TRUST_FOLDER for folder in state_folders()]
+
+
+# Who made a bundle: an authentication code shows that this user made it on this machine.
+
+_PURPOSE = "crash bundle"
+
+
+def authenticate_bundle(bundle: Bundle) -> str:
+    """Return the authentication code of a bundle that this process writes; empty if its snapshot is not this user's.
+
+    Without this condition, a crash that was minimized or confirmed in another person's hunt would count as made here.
+    """
+    try:
+        made_here = snapshot_of(bundle).is_made_here
+    except CrashhuntError:  # there is none, as of a candidate of a minimization
+        return ""
+    return authentication_code(_PURPOSE, _statement(bundle)) if made_here else ""
+
+
+def is_bundle_made_here(bundle: Bundle) -> bool:
+    """Return whether this user made a bundle and its snapshot on this machine. The files of the snapshot are not read.
+
+    Raises:
+        BundleError: the manifest of the snapshot is missing or damaged.
+    """
+    return snapshot_of(bundle).is_made_here and is_authentic(_PURPOSE, _statement(bundle), bundle.authentication_code)
+
+
+def _statement(bundle: Bundle) -> dict[str, object]:
+    """Return everything in a bundle that determines what runs, and the recording's digest, as text to authenticate."""
+    spec = bundle.result.spec.to_json()
+    return {
+        **{name: spec[name] for name in ("number", "seed", "max_steps", "arguments", "scenario_arguments")},
+        "disturbances": spec.get("disturbances") or [],
+        "only": spec.get("only"),
+        "script": spec.get("script"),
+        "digest": bundle.result.digest,
+        "snapshot": bundle.snapshot,
+    }
+
+
+# Whether the code of a crash, a snapshot or a hunt may run.
 
 
 def is_bundle_trusted(bundle: Bundle, *, faults: Sequence[str] | None = None) -> bool:
@@ -364,22 +405,6 @@ def _fingerprint_of_repository(top: Path) -> str:
     one (a file ``.git``).
     """
     return hashlib.sha256(f"repository\0{top}\0{git_directory(top)}".encode("utf-8", "surrogateescape")).hexdigest()
-
-
-# Whose a bundle is: an archive that this user made on this machine is signed, and every other one is a stranger's.
-
-
-def is_made_here(index: ArchiveIndex) -> bool:
-    """Return whether this user has signed an archive on this machine."""
-    said = index.get("signature")
-    return isinstance(said, str) and said.isascii() and hmac.compare_digest(said, signature(index))
-
-
-def signature(index: ArchiveIndex) -> str:
-    """Return the signature of an archive, which only this user on this machine can compute."""
-    content = {name: value for name, value in index.items() if name != "signature"}
-    text = json.dumps(content, sort_keys=True, default=str).encode()
-    return hmac.new(user_key(), text, "sha256").hexdigest()
 
 
 # What a stranger's crash may make this process do when its recorded actions are driven: simulate, and nothing else.

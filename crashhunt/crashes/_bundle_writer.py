@@ -12,7 +12,8 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree, whole_file
 from crashhunt.base.integrity import FileEntry, digest_of_content, digest_of_data
 from crashhunt.base.temporary import temporary_beside
-from crashhunt.crashes._bundle import SCHEMA, Bundle, authenticate_bundle, describe_other_files
+from crashhunt.crashes._bundle import SCHEMA, Bundle, describe_other_files
+from crashhunt.crashes._bundle_trust import authenticate_bundle
 from crashhunt.recording import Recording, read_black_box
 
 if TYPE_CHECKING:
