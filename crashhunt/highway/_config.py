@@ -14,7 +14,7 @@ from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.simulators import as_tables, merge
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from crashhunt.scenario import Scenario
     from crashhunt.trial import Value
@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 Config: TypeAlias = dict[str, Any]
 """The configuration of a highway-env environment; highway-env's classes define its entries."""
 
-_pristine: dict[type, dict[str, int | float | str]] = {}
+_Plain: TypeAlias = dict[str, int | float | str]
+Changes: TypeAlias = dict[type, _Plain]
+"""Plain attributes of the classes of road objects in which an environment has changed one."""
+
+_pristine: Changes = {}
+_changes: Changes = {}  # in force: those of the environment that was reset last
 
 
 def configured(default: Config, scenario: Scenario, arguments: Mapping[str, Value]) -> Config:
@@ -54,19 +59,44 @@ def mistake(scenario: Scenario, key: str, value: object, message: str, fix: str)
     return ScenarioError(f"highway.{key} = {value!r} {message}", fix=fix, where=scenario.origin)
 
 
-def restore_classes() -> None:
-    """Restore class attributes that environments change, such as the jam distance of all drivers."""
+def restore_classes(changes: Changes | None = None) -> None:
+    """Restore class attributes that environments change, such as drivers' jam distance; then apply changes."""
+    changes = changes or {}
+    for kind, plain, was in _kinds():
+        wanted = changes.get(kind, was)
+        if plain != wanted:
+            for name in plain.keys() - wanted.keys():
+                delattr(kind, name)
+            for name, value in wanted.items():
+                setattr(kind, name, value)
+    _keep(changes)
+
+
+def note_changes() -> Changes:
+    """Return what the environment that was just reset has changed in classes, for `apply_changes`."""
+    return _keep({kind: plain for kind, plain, was in _kinds() if plain != was})
+
+
+def apply_changes(changes: Changes) -> None:
+    """Give classes the attributes of an environment again, if another environment of this process was reset since."""
+    if changes != _changes:
+        restore_classes(changes)
+
+
+def _keep(changes: Changes) -> Changes:
+    _changes.clear()
+    _changes.update(changes)
+    return changes
+
+
+def _kinds() -> Iterator[tuple[type, _Plain, _Plain]]:
+    """Yield each class of road objects, with its plain attributes now and before the first environment."""
     waiting: list[type] = [RoadObject]
     while waiting:
         kind = waiting.pop()
         waiting += kind.__subclasses__()
         plain = {name: value for name, value in vars(kind).items() if isinstance(value, int | float | str)}
-        was = _pristine.setdefault(kind, plain)
-        if plain != was:
-            for name in plain.keys() - was.keys():
-                delattr(kind, name)
-            for name, value in was.items():
-                setattr(kind, name, value)
+        yield kind, plain, _pristine.setdefault(kind, plain)
 
 
 def _set_controlled_vehicles(scenario: Scenario, config: Config) -> None:

@@ -30,7 +30,7 @@ from highway_env.vehicle.objects import Obstacle, RoadObject
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.base.foreign_code import Boundary, Party, number_of, truth_of
 from crashhunt.base.plugins import describe_unused_clone
-from crashhunt.highway._config import configured, mistake, restore_classes
+from crashhunt.highway._config import apply_changes, configured, mistake, note_changes, restore_classes
 from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
 from crashhunt.highway._lane_parts import LANE_PARTS, LaneParts
@@ -125,6 +125,7 @@ class HighwaySimulator:
         except Exception as error:
             message = f"highway-env could not set up the episode: {type(error).__name__}: {error}"
             raise InvalidEpisodeError(message) from error
+        self._class_changes = note_changes()
         self._adopt(env)
         self._lane_names.clear()
         self.agents = list(self._possible)
@@ -177,6 +178,7 @@ class HighwaySimulator:
                 f"trials run beyond the {self._own_duration_s:g} s after which {self._setup.id!r} ends its episodes: "
                 'set highway.time_limit = "registered" to end them there'
             )
+        apply_changes(self._class_changes)
         with self._skipping:
             shown, reward, terminated, truncated, info = self._env.step(tuple(given) if self._many_act else given[0])
         self._info = info

@@ -271,17 +271,19 @@ def test_the_end_of_the_road_is_an_arrival(tmp_path):
     assert simulator.scene().points[0][0] < 10_050
 
 
-def test_what_one_episode_changes_in_classes_does_not_reach_the_next(tmp_path):
+def test_what_one_episode_changes_in_classes_does_not_reach_another(tmp_path):
     """The intersection lowers the jam distance of all drivers in the process."""
     from highway_env.vehicle.behavior import IDMVehicle
 
-    simulator = simulator_of(tmp_path, "highway-fast-v0")
-    before = [step[1] for step in drive(simulator, "IDLE", 10)]
-    other = simulator_of(tmp_path, "intersection-v0")
-    other.reset(seed=1)
+    def scenes(simulator):
+        return ([*simulator.scene().data.flat] for _ in drive(simulator, "IDLE", 5))
+
+    one, other = (simulator_of(tmp_path, name) for name in ("highway-fast-v0", "intersection-v0"))
+    alone = [*scenes(one)], [*scenes(other)]
     assert IDMVehicle.DISTANCE_WANTED == 7
-    assert [step[1] for step in drive(simulator, "IDLE", 10)] == before
+    assert [*scenes(one)] == alone[0]
     assert IDMVehicle.DISTANCE_WANTED == 10
+    assert [*zip(scenes(one), scenes(other), strict=True)] == [*zip(*alone, strict=True)]
 
 
 KEPT = "the environment 'highway-fast-v0' ends an episode after 30 s, which is its own duration; set highway.time_limit"
