@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.dashboard._trial_counts import Point
+    from crashhunt.dashboard._plotted_trials import Point
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics import Comparison
     from crashhunt.trial import Value

@@ -14,7 +14,8 @@ from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.base.text import command_line
 from crashhunt.crashes import read_notes
 from crashhunt.dashboard._catalog import FoundHunt, unreadable, unreadable_below
-from crashhunt.dashboard._trial_counts import Sample, TrialCounts
+from crashhunt.dashboard._plotted_trials import Sample
+from crashhunt.dashboard._trial_counts import TrialCounts
 from crashhunt.ledger import Ledger, damaged, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.results import (

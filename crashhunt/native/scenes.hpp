@@ -396,7 +396,7 @@ PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t cou
 }
 
 // in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
-// As Sight._in_sight of sumo/_range_of_sight.py: who is near one of the controlled vehicles, and where
+// As Sight._in_sight of sumo/_scene_reader.py: who is near one of the controlled vehicles, and where
 // these are.
 PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ._descriptor import BACKEND as BACKEND
     from ._fleet import Fleet as Fleet
     from ._options import SumoSetup as SumoSetup, writes as writes
-    from ._range_of_sight import Sight as Sight
+    from ._scene_reader import Sight as Sight
     from ._simulator import SumoSimulator as SumoSimulator
     from ._traffic_events import SumoEvents as SumoEvents
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, ParamSpec, Protocol, TypeVar
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.sumo._range_of_sight import reach_of
+from crashhunt.sumo._scene_reader import reach_of
 from crashhunt.world import Scene
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from crashhunt.native import Columns, Core, Draft, Vehicles
     from crashhunt.simulators import Kinematics, Observations, Simulator, StepResult
-    from crashhunt.sumo._range_of_sight import Sight
+    from crashhunt.sumo._scene_reader import Sight
     from crashhunt.sumo._traffic_events import SumoEvents
     from crashhunt.world import Actor, Roster
 

@@ -33,7 +33,7 @@ from crashhunt.world import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from crashhunt.sumo._range_of_sight import Sight
+    from crashhunt.sumo._scene_reader import Sight
     from crashhunt.trial import Value
     from crashhunt.world import Spine
 

@@ -46,8 +46,8 @@ from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._omitted_demand import OmittedDemand
 from crashhunt.sumo._options import SumoSetup
-from crashhunt.sumo._range_of_sight import Sight
 from crashhunt.sumo._reader_protocol import Moment
+from crashhunt.sumo._scene_reader import Sight
 from crashhunt.sumo._scripted import ScriptedSight, manoeuvre_paths, place_agents
 from crashhunt.sumo._surroundings import nearest_ahead_of, surroundings_of, unregulated_junctions
 from crashhunt.sumo._traffic_events import SumoEvents

@@ -13,11 +13,12 @@ from conftest import crashes_on_loop, examples
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.crashes import list_near_misses, most_dangerous
-from crashhunt.dashboard import _trial_counts as _trials
+from crashhunt.dashboard import _plotted_trials, _trial_counts as _trials
 from crashhunt.dashboard._catalog import Catalog
 from crashhunt.dashboard._crash_list import CrashList
 from crashhunt.dashboard._hunt_page import HuntView
-from crashhunt.dashboard._trial_counts import Sample, TrialCounts
+from crashhunt.dashboard._plotted_trials import Sample
+from crashhunt.dashboard._trial_counts import TrialCounts
 from crashhunt.ledger import Ledger
 from crashhunt.statistics import counts_suffice, measure_rates, rate_of_counts
 from crashhunt.training import HeldOutTraffics, TrainedOn
@@ -106,7 +107,7 @@ def test_counts_are_those_of_the_ledger_in_any_order(tmp_path_factory, count, rn
 
 @pytest.mark.parametrize("at_once", [True, False])
 def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, at_once):
-    monkeypatch.setattr(_trials, "MAX_POINTS", 100)
+    monkeypatch.setattr(_plotted_trials, "MAX_POINTS", 100)
     crashed = set(random.Random(1).sample(range(3_000), 60))
     path = tmp_path / "ledger.sqlite"
     sample, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.dashboard import _trial_counts as _trials
-from crashhunt.dashboard._trial_counts import Sample, TrialCounts, _point, is_drawn
+from crashhunt.dashboard import _plotted_trials, _trial_counts as _trials
+from crashhunt.dashboard._plotted_trials import Sample, _point, is_drawn
+from crashhunt.dashboard._trial_counts import TrialCounts
 from crashhunt.report._page import _rounded
 from crashhunt.results import TrialRow
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
@@ -54,10 +55,10 @@ def test_drawn_trials_are_evenly_spaced_and_of_a_smaller_share_a_subset():
 
 def test_first_sample_has_the_trials_that_each_one_is_asked_for(monkeypatch):
     """What is read of all numbers at once is what is drawn of each number."""
-    monkeypatch.setattr(_trials, "_CHUNK_TRIALS", 64)
+    monkeypatch.setattr(_plotted_trials, "_CHUNK_TRIALS", 64)
     for most, last, crashes, most_crashes in ((100, 99, 10, 10), (100, 100, 10, 10), (30, 399, 20, 19), (7, 499, 9, 3)):
-        monkeypatch.setattr(_trials, "MAX_POINTS", most)
-        monkeypatch.setattr(_trials, "MAX_CRASHES", most_crashes)
+        monkeypatch.setattr(_plotted_trials, "MAX_POINTS", most)
+        monkeypatch.setattr(_plotted_trials, "MAX_CRASHES", most_crashes)
         trials = {n: Outcome.COLLISION if n % 50 == 1 else Outcome.SURVIVED for n in range(last + 1)}
         share, crash_share = 1.0, 1.0
         while (last + 1) * share > most:
@@ -74,8 +75,8 @@ def test_first_sample_has_the_trials_that_each_one_is_asked_for(monkeypatch):
 
 @pytest.mark.parametrize("outcome", [Outcome.SURVIVED, Outcome.COLLISION])
 def test_sample_is_halved_when_it_has_one_too_many(monkeypatch, outcome):
-    monkeypatch.setattr(_trials, "MAX_POINTS", 20)
-    monkeypatch.setattr(_trials, "MAX_CRASHES", 20)
+    monkeypatch.setattr(_plotted_trials, "MAX_POINTS", 20)
+    monkeypatch.setattr(_plotted_trials, "MAX_CRASHES", 20)
     other = Outcome.COLLISION if outcome is Outcome.SURVIVED else Outcome.SURVIVED
     trials = {n: outcome if n < 60 else other for n in range(70)}
     sample = Sample(CRASH_ON)

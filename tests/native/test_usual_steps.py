@@ -672,7 +672,7 @@ FURTHER = (
 
 
 def test_vehicles_of_all_sizes_and_names_are_recorded_as_python_does(tmp_path, monkeypatch):
-    from crashhunt.sumo import Sight, _range_of_sight
+    from crashhunt.sumo import Sight, _scene_reader
 
     read, actor_of = [], Sight._actor
     monkeypatch.setattr(Sight, "_actor", lambda sight, vehicle: (read.append(vehicle), actor_of(sight, vehicle))[1])
@@ -683,7 +683,7 @@ def test_vehicles_of_all_sizes_and_names_are_recorded_as_python_does(tmp_path, m
         return 0.0 if step % 100 < 60 else 8.0, 0
 
     for sight_m in (12.0, 20.0, 30.0, 45.0):
-        monkeypatch.setattr(_range_of_sight, "_SIGHT_SQUARED", sight_m**2)
+        monkeypatch.setattr(_scene_reader, "_SIGHT_SQUARED", sight_m**2)
         whole = street.run(waits, at_once=False, steps=300, crash_on=())
         read.clear()
         assert street.run(waits, steps=300, crash_on=()) == whole

@@ -12,13 +12,13 @@ from fake_sumo import FakeSumo, gone
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.scenario import AgentSetup
-from crashhunt.sumo import _bent_vehicles, _insertion, _range_of_sight, _reported_collisions, _scripted, _traffic_survey
+from crashhunt.sumo import _bent_vehicles, _insertion, _reported_collisions, _scene_reader, _scripted, _traffic_survey
 from crashhunt.sumo._bent_vehicles import Bends
-from crashhunt.sumo._range_of_sight import Sight
+from crashhunt.sumo._scene_reader import Sight
 from crashhunt.trial import ALL_AGENTS
 from crashhunt.world import Actor
 
-MODULES = (_bent_vehicles, _insertion, _range_of_sight, _reported_collisions, _scripted, _traffic_survey)
+MODULES = (_bent_vehicles, _insertion, _scene_reader, _reported_collisions, _scripted, _traffic_survey)
 
 
 @pytest.fixture
