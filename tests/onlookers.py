@@ -1,18 +1,28 @@
-"""An agent and an observer with which tests look at what others do."""
+"""Agents and an observer with which tests look at what others do."""
 
 from __future__ import annotations
 
 from crashhunt.episode import Observer
 
 
-class Steady:
+class Always:
+    """Returns the same action in each step, whatever it sees."""
+
+    def __init__(self, action):
+        self.action = action
+
+    def reset(self, seed):
+        pass
+
+    def act(self, observation):
+        return self.action
+
+
+class Steady(Always):
     """Drives at a speed that may be set, whoever is in the way."""
 
     def __init__(self, speed=8.0):
         self.speed = speed
-
-    def reset(self, seed):
-        pass
 
     def act(self, observation):
         return self.speed, 0

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from onlookers import Always
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode._reference_driver_takeover import CompetentDriver
@@ -22,18 +23,7 @@ KEEPS_SPEED = {
 }
 
 
-class Blind:
-    def __init__(self, action):
-        self.action = action
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return self.action
-
-
-class OpenLoop(Blind):
+class OpenLoop(Always):
     """Follows the plan of the first step, wherever the vehicle is."""
 
     def act(self, observation):
@@ -53,7 +43,7 @@ def driven(folder, form):
     simulator = SumoSimulator(scenario, folder)
     try:
         observations, _ = simulator.reset(seed=1, options={"arguments": CASE})
-        agent = OpenLoop(simulator) if form == "trajectory" else Blind(KEEPS_SPEED.get(form, 1))
+        agent = OpenLoop(simulator) if form == "trajectory" else Always(KEEPS_SPEED.get(form, 1))
         driver = CompetentDriver(agent, simulator, Overruled("ego", 0, reference="fsm", other="other"))
         driver.reset(1)
         speeds = []

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from onlookers import Steady
 
 from crashhunt.agents import REFERENCE_MODELS
 from crashhunt.base.errors import InvalidEpisodeError
@@ -42,16 +43,8 @@ class StraightRoad:
         self.beside = max(0.0, self.beside - self.lateral * STEP_S)
 
 
-class Blind:
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return 20.0, 0
-
-
 def taken_over(road, model, *, steps=120, after=0):
-    made = overruled_agent(Blind(), road, Overruled("ego", after, reference=model, other="lead"))
+    made = overruled_agent(Steady(20.0), road, Overruled("ego", after, reference=model, other="lead"))
     made.reset(0)
     speeds = []
     for _ in range(steps):
@@ -123,9 +116,9 @@ def test_model_needs_actions_with_a_speed_and_a_simulator_that_knows_the_road():
     road = StraightRoad(gap=12.0)
     road.actions = {"ego": MetaAction()}
     with pytest.raises(InvalidEpisodeError, match="set neither a speed nor an acceleration"):
-        overruled_agent(Blind(), road, Overruled("ego", 0, reference="fsm", other="lead"))
+        overruled_agent(Steady(20.0), road, Overruled("ego", 0, reference="fsm", other="lead"))
     with pytest.raises(InvalidEpisodeError, match="reports no surroundings"):
-        overruled_agent(Blind(), SimpleNamespace(), Overruled("ego", 0, reference="fsm", other="lead"))
+        overruled_agent(Steady(20.0), SimpleNamespace(), Overruled("ego", 0, reference="fsm", other="lead"))
 
 
 def in_bend(turn, distance):

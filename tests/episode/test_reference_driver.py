@@ -9,6 +9,7 @@ import pytest
 from conftest import examples
 from gymnasium import spaces
 from hypothesis import given, settings, strategies as st
+from onlookers import Always
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
@@ -41,19 +42,8 @@ class Road:
         self.gap += (self.leader - self.speed) * DT
 
 
-class Reckless:
-    def __init__(self, action=(35.0, 0)):
-        self.action = action
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return self.action
-
-
 def driver(road, faculty, action=(35.0, 0), after=0):
-    made = overruled_agent(Reckless(action), road, Overruled("ego", after, reference=faculty))
+    made = overruled_agent(Always(action), road, Overruled("ego", after, reference=faculty))
     made.reset(0)
     return made
 

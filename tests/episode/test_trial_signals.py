@@ -7,6 +7,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+from onlookers import Always
 
 from crashhunt.base.errors import UnusableValueError
 from crashhunt.episode import Episode, TrialSignals
@@ -57,15 +58,7 @@ class Scripted:
         return (self.speeds.pop(0), 0) if self.speeds else (0.0, 0)
 
 
-class Zero:
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return 0
-
-
-def episode_of(simulator, *requirements, agent=Zero, steps=20, oracles=(), arguments=None):
+def episode_of(simulator, *requirements, agent=lambda: Always(0), steps=20, oracles=(), arguments=None):
     oracles = [*oracles] + [parse_oracle(text).make() for text in requirement_oracles(requirements)]
     spec = TrialSpec(number=0, seed=3, arguments={}, scenario_arguments=arguments or {}, max_steps=steps)
     return Episode(spec, simulator=simulator, make_agent=lambda *_: agent(), oracles=oracles, crash_on=HUNTED)

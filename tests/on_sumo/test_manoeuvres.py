@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from onlookers import Steady
 
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import load_scenario
@@ -44,17 +45,9 @@ def drive(simulator, observation, agent, steps):
     return scenes
 
 
-class KeepsSpeed:
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return 60 / 3.6, 0
-
-
 @pytest.mark.parametrize("side", [1, -1])
 def test_vehicle_cuts_in_at_the_gap_and_with_the_lateral_speed_of_the_arguments(simulate, side):
-    scenes = drive(*simulate("r157-cut-in", **CUT_IN, side=side), KeepsSpeed(), 60)
+    scenes = drive(*simulate("r157-cut-in", **CUT_IN, side=side), Steady(60 / 3.6), 60)
     ego, other = (np.array([scene.points[scene.roster.index[name]] for scene in scenes]) for name in ("ego", "other"))
     gaps, lateral = other[:, 0] - 4.3 - ego[:, 0], (other[:, 1] - ego[:, 1]) * side
     assert gaps[6] == pytest.approx(12.5)  # after six steps of 0.15 m/s, the lateral speed is 0.9 m/s
@@ -79,7 +72,7 @@ STRAIGHT = {
 @pytest.mark.parametrize("name", STRAIGHT)
 def test_other_road_users_are_at_the_places_of_their_motions(simulate, name):
     values, side = {"ego_kmh": 60.0, **STRAIGHT[name]}, STRAIGHT[name].get("side", -1)
-    scenes = drive(*simulate(f"r157-{name}", **values), KeepsSpeed(), 80)
+    scenes = drive(*simulate(f"r157-{name}", **values), Steady(60 / 3.6), 80)
     motions = manoeuvre_motions(name.replace("-", "_"), values, -3.5 - 1.75 * side, -3.5 + 1.75 * side, 0.1)
     for step, (scene, motion) in enumerate(zip(scenes, motions, strict=False)):
         found = {name: (*scene.points[row], scene.speeds[row]) for name, row in scene.roster.index.items()}
@@ -108,19 +101,19 @@ def signal(name, kind, duration_s, *points):
 def test_vehicle_ahead_drives_a_speed_profile(simulate):
     profile = signal("slower_kmh", "linear", 8.0, 0.0, 36.0, 18.0, 80.0, 20.0)
     values = STRAIGHT["following"] | profile
-    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **values), KeepsSpeed(), 80)
+    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **values), Steady(60 / 3.6), 80)
     speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
     slower = np.interp(np.arange(81) * 0.1, [0, 2, 4, 6, 8], [0, 36, 18, 80, 20])
     assert speeds == pytest.approx(np.maximum(0, 60 - slower) / 3.6)
     jump = STRAIGHT["following"] | signal("slower_kmh", "constant", 8.0, 36.0)
-    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **jump), KeepsSpeed(), 20)
+    scenes = drive(*simulate("r157-following", ego_kmh=60.0, **jump), Steady(60 / 3.6), 20)
     speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
     assert speeds == pytest.approx(np.maximum(24 / 3.6, 60 / 3.6 - np.arange(21)))  # 10 m/s² at most
 
 
 def test_deceleration_of_the_vehicle_ahead_follows_a_signal(simulate):
     profile = signal("decel_mps2", "constant", 4.0, 2.0, 0.0, 6.0)
-    scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, headway_s=2.0, **profile), KeepsSpeed(), 40)
+    scenes = drive(*simulate("r157-deceleration", ego_kmh=60.0, headway_s=2.0, **profile), Steady(60 / 3.6), 40)
     speeds = [scene.speeds[scene.roster.index["leader"]] for scene in scenes]
     changes = np.where(np.arange(40) * 0.1 < 4 / 3 - 1e-9, 2.0, np.where(np.arange(40) * 0.1 < 8 / 3 - 1e-9, 0.0, 6.0))
     assert -np.diff(speeds) / 0.1 == pytest.approx(changes)
@@ -129,7 +122,7 @@ def test_deceleration_of_the_vehicle_ahead_follows_a_signal(simulate):
 def test_walk_of_the_person_follows_a_signal_to_the_place_of_impact(simulate):
     profile = signal("walk_kmh", "linear", 12.0, 1.0, 9.0, 3.0)
     values = STRAIGHT["pedestrian"] | profile
-    scenes = drive(*simulate("r157-pedestrian", ego_kmh=60.0, **values), KeepsSpeed(), 70)
+    scenes = drive(*simulate("r157-pedestrian", ego_kmh=60.0, **values), Steady(60 / 3.6), 70)
     y = np.array([scene.points[scene.roster.index["person walker"]][1] for scene in scenes])
     walks = np.interp(np.arange(70) * 0.1, [0, 6, 12], [1.0, 9.0, 3.0]) / 3.6
     moving = np.diff(y) > 1e-9
