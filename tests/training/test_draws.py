@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +13,6 @@ from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env
 from crashhunt.training._crash_env import CrashReplay
 from crashhunt.training._held_out_traffics import is_test_traffic, read_trained_on
-from crashhunt.training._training_episodes import _seeded
 
 
 def test_probabilities_are_those_of_prioritized_level_replay():
@@ -144,7 +142,9 @@ def test_record_of_a_training_has_its_seeds(make, tmp_path):
         ({"max_steps": 1.5}, "max_steps is 1.5"),
         ({"crash_reward": math.nan}, "crash_reward is nan"), ({"test": 1.0}, "test is 1"), ({"agent": 3}, "agent is 3"),
         ({"render_mode": "human"}, "render_mode is 'human'"), ({"trained_on": 3}, "trained_on is 3"),
-        ({"trained_on": "a\0b"}, "trained_on is 'a"),
+        ({"trained_on": "a\0b"}, "trained_on is 'a"), ({"after_s": None}, "after_s is None"),
+        ({"share": "x"}, "share is 'x'"), ({"test": None}, "test is None"),
+        ({"crash_reward": "a"}, "crash_reward is 'a"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(make, options, message):
@@ -153,9 +153,9 @@ def test_options_out_of_range_are_named(make, options, message):
     assert str(caught.value).startswith(message)
 
 
-@pytest.mark.parametrize("places", [[], 3, [3], None])
+@pytest.mark.parametrize("places", [[], 3, [3], None, b"falls"])
 def test_places_are_folders(places):
-    with pytest.raises(UsageError, match=r"^crashes is (empty|3|\[3\]|None)"):
+    with pytest.raises(UsageError, match=r"^crashes is (empty|3|\[3\]|None|b'falls')"):
         CrashEnv(places)
     assert _crash_env._places("h") == ["h"]
 
@@ -242,20 +242,3 @@ def test_outcome_of_an_episode_counts_for_its_crash_and_its_reward(make):
     assert env.scores["h/1-x"] == pytest.approx(0.84)  # a plain episode is no crash's
     env.reset(seed=3)
     assert set(env.scores.values()) == {1.0}
-
-
-def test_generators_of_the_caller_continue_where_they_were():
-    random.seed(5)
-    np.random.seed(6)  # noqa: NPY002 - the global generator is meant
-    expected = None
-    for seeds in ((), (1, 1, 2)):
-        random.seed(5)
-        np.random.seed(6)  # noqa: NPY002
-        drawn = []
-        for seed in seeds:
-            with _seeded(seed):
-                drawn.append((random.random(), float(np.random.random())))  # noqa: NPY002
-        after = random.random(), float(np.random.random())  # noqa: NPY002
-        assert expected in (None, after)
-        expected = after
-    assert drawn[0] == drawn[1] != drawn[2]

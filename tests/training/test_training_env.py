@@ -25,11 +25,10 @@ from gymnasium.utils.env_checker import check_env
 
 import crashhunt
 from crashhunt.crashes import list_bundles
-from crashhunt.errors import CrashhuntError, SimulatorError, UsageError
+from crashhunt.errors import CrashhuntError, SimulatorError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, _training_episodes as _episodes
 from crashhunt.training._crash_env import CrashReplay
-from crashhunt.training._held_out_traffics import is_test_traffic
 from crashhunt.training._training_episodes import _Start
 from crashhunt.trial import Outcome
 
@@ -127,32 +126,11 @@ def test_same_seed_gives_the_same_episodes(crashes):
     assert len(names) > 1
 
 
-def test_only_training_traffics_are_used(crashes):
-    env = CrashEnv(crashes, before_s=BEFORE_S, share=0.3, test=0.6, max_steps=1)
-    seeds = [env.reset(seed=1)[1]["seed"], *(env.reset()[1]["seed"] for _ in range(30))]
-    assert len(set(seeds)) > 15
-    assert not any(is_test_traffic(seed, 0.6) for seed in seeds)
-    held_out = [bundle.id for bundle in list_bundles(crashes) if is_test_traffic(bundle.result.spec.seed, 0.6)]
-    with pytest.raises(UsageError, match="is in the test part"):
-        env.reset(options={"crash": held_out[0]})
-
-
 def test_the_users_random_generators_keep_their_state(env):
     before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002 - which scenarios may use
     env.reset(seed=1)
     finish(env)
     assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
-
-
-def test_crash_reward_is_added_once(crashes):
-    totals = []
-    for reward in (0.0, -100.0):
-        env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0, crash_reward=reward)
-        env.reset(seed=1)
-        info, total = finish(env)
-        assert info["has_crashed"]
-        totals.append(total)
-    assert totals[0] - totals[1] == pytest.approx(100.0)
 
 
 def test_passes_gymnasiums_checker(crashes):
@@ -197,22 +175,6 @@ def remote(crashes):
     made.close()
 
 
-def interrupt(*_words):
-    raise KeyboardInterrupt
-
-
-def test_after_an_interrupt_the_next_request_gets_its_own_answer(remote, monkeypatch):
-    name = remote.crashes[0]
-    observation, info = remote.reset(options={"crash": name})
-    for _ in range(3):
-        with monkeypatch.context() as patch:
-            patch.setattr(remote._episodes, "_answers", SimpleNamespace(poll=interrupt))
-            with pytest.raises(KeyboardInterrupt):
-                remote.step(1)
-        again, info_again = remote.reset(options={"crash": name})
-        assert (again.tobytes(), info_again) == (observation.tobytes(), info)
-
-
 @pytest.mark.parametrize("crash", [pytest.param("", marks=pytest.mark.nightly), None])
 def test_a_killed_process_is_reported_whatever_is_asked_next(remote, crash):
     remote.reset(seed=1)
@@ -241,21 +203,6 @@ def test_requests_of_several_threads_do_not_mix(remote):
     for thread in threads:
         thread.join()
     assert not failed
-
-
-def test_a_recording_that_differs_is_not_used(crashes):
-    env = CrashEnv(crashes, before_s=BEFORE_S, share=1.0)
-    first = env.crashes[0]
-    env.reset(options={"crash": first})
-    start = env._episodes._starts[0]
-    other = tuple(np.asarray(4 - action) for action in start.actions)  # SLOWER in place of IDLE and FASTER
-    env._episodes._starts[0] = replace(start, actions=other)
-    with pytest.raises(SimulatorError, match=f"{first} is not used: the (scene|observation) of step"):
-        env.reset(options={"crash": first})
-    with pytest.warns(UserWarning, match=first):
-        names = {env.reset(seed=1)[1]["crash"], *(env.reset()[1]["crash"] for _ in range(20))}
-    assert first not in names
-    assert names
 
 
 def test_a_compact_recording_is_compared_by_the_actors_that_it_has(crashes):
@@ -289,20 +236,8 @@ def refused(crashes, **options):
 
 
 def test_bad_input_is_one_line(crashes, tmp_path):
-    assert "crashes is empty" in refused([])
     assert "'nowhere' is not a directory" in refused("nowhere")
     assert "no crash was saved here" in refused(tmp_path)
-    for name, value in (
-        ("before_s", 0.0), ("after_s", float("nan")), ("share", 1.5), ("test", 1.0), ("max_steps", 0),
-        ("crash_reward", float("inf")),
-    ):  # fmt: skip
-        assert f"{name} is " in refused(crashes, **{name: value}), name
-    # As from a configuration file.
-    wrong = {"before_s": "5", "after_s": None, "share": "x", "test": None, "crash_reward": "a", "max_steps": 1.5}
-    for name, value in {**wrong, "agent": 3, "trained_on": "a\0b"}.items():
-        assert f"{name} is {value!r}" in refused(crashes, **{name: value})
-    for places in (7, [None], b"falls"):
-        assert f"crashes is {places!r}" in refused(places)
     assert "no controlled vehicle 'other'" in refused(crashes, agent="other")
     assert "crashes is in the training part (test=0.999999)" in refused(crashes, test=0.999999)
 
@@ -332,13 +267,9 @@ def test_a_crash_without_its_snapshot_is_refused(crashes, tmp_path):
     assert "the snapshot has no manifest" in refused(copy)
 
 
-def test_wrong_use_is_reported(env):
+def test_step_before_a_reset_is_reported(env):
     with pytest.raises(SimulatorError, match="no episode is running"):
         env.step(1)
-    with pytest.raises(UsageError, match="options has 'crashes'"):
-        env.reset(options={"crashes": "x"})
-    with pytest.raises(UsageError, match="there is no crash '000999-collision'"):
-        env.reset(options={"crash": "000999-collision"})
 
 
 @pytest.mark.parametrize(
@@ -498,18 +429,6 @@ def test_no_process_outlives_a_training(crashes, tmp_path, attack):
 
 
 # Which crash is drawn.
-
-
-def test_unsolved_crashes_are_drawn_more_often_and_solved_ones_return():
-    replay, rng = CrashReplay(4), np.random.default_rng(1)
-    draws = np.zeros(4)
-    for _ in range(400):
-        index = replay.draw(rng)
-        draws[index] += 1
-        replay.record(index, has_crashed=index == 2)
-    assert draws[2] > 0.75 * draws.sum()
-    assert all(draws >= 5)
-    assert replay.probabilities().sum() == pytest.approx(1.0)
 
 
 def test_a_removed_crash_is_never_drawn_also_after_a_restart():
