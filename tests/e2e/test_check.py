@@ -199,21 +199,6 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     assert second.name
 
 
-def test_no_crash_in_other_traffic_is_no_fix(hunt, crash):
-    """One draw of other traffic shows nothing."""
-    found = in_other_traffic(crash, "--scenario", "toy", "--set", "gap_m=500")
-    assert found == (1, "not_comparable")
-    code, out, _ = command("replay", crash, "--expect", "fixed", "--json", "--set", "speed=4")
-    assert (code, json.loads(out)["verdict"]) == (0, "fixed")
-
-
-def in_other_traffic(crash, *words):
-    code, out, _ = command("replay", crash, "--expect", "fixed", "--json", *words)
-    found = json.loads(out)
-    assert "does not show a fix" in found["reason"]
-    return code, found["verdict"]
-
-
 def test_hunts_are_not_compared_where_one_has_a_damaged_ledger(hunt):
     with closing(sqlite3.connect(hunt / "ledger.sqlite")) as database, database:
         # In a column that compare itself does not read, of the trial that is read for the time at which it ended.

@@ -24,20 +24,6 @@ def survivors(hunt):
     return sorted((row for row in rows if row["outcome"] in ("survived", "finished")), key=lambda row: -row["danger"])
 
 
-def test_they_are_the_most_dangerous_survivors(hunt):
-    kept = json.loads((hunt.folder / "run.json").read_text())["near_misses"]
-    rows = survivors(hunt)
-    assert len(rows) > 2
-    assert [one["trial"] for one in kept] == [row["number"] for row in rows[:2]]
-    assert [one["danger"] for one in kept] == [row["danger"] for row in rows[:2]]
-    assert 1 > kept[0]["danger"] >= kept[1]["danger"] > 0
-    assert all(one["confirmed"] for one in kept)
-    folders = sorted(path.name for path in (hunt.folder / "h" / "near-misses").iterdir())
-    assert folders == sorted(one["id"] for one in kept)
-    assert hunt.crashhunt("status", "h", "--json").json["hunts"][0]["crashes"] == 8 - len(rows)
-    assert hunt.crashhunt("check", "h", "--json").json["fine"]
-
-
 def test_it_is_reported_around_the_moment_when_it_was_nearest(hunt):
     number = str(survivors(hunt)[0]["number"])
     words = ("h", "--crash", number)
@@ -86,14 +72,3 @@ def test_without_a_crash_there_is_nothing_to_be_fixed(hunt):
     assert slower["verdict"] == "diverged"
     faster = hunt.crashhunt("replay", "h", "--crash", number, "--set", "gap_m=10", expect=1)
     assert "changed: it crashes now" in faster.out
-
-
-def test_a_hunt_that_continues_keeps_those_of_all_its_trials(hunt):
-    before = {path.name: path.stat().st_mtime_ns for path in (hunt.folder / "h" / "near-misses").iterdir()}
-    done = hunt.crashhunt(*WORDS[:3], "8", *WORDS[4:], "--near-misses", "1", "--json").json
-    (kept,) = done["near_misses"]
-    (left,) = (hunt.folder / "h" / "near-misses").iterdir()
-    assert left.name == kept["id"]
-    assert left.stat().st_mtime_ns == before[left.name]  # which was not run again
-    assert "near_misses" not in hunt.crashhunt(*WORDS, "--json").json
-    assert left.exists()
