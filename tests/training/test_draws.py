@@ -66,13 +66,13 @@ class Episodes:
 
 @pytest.fixture
 def make(monkeypatch):
-    """Make environments with four crashes, of which the last is in the test part."""
+    """Make environments with five crashes, of which the last two are in the test part."""
 
     def crash(name, seed):
         bundle = SimpleNamespace(path=Path("h") / name, id=name, hunt=Path("h") / str(seed % 2))
         return SimpleNamespace(name=f"h/{name}", seed=seed, bundle=bundle)
 
-    crashes = [crash(f"{n}-x", n) for n in range(4)]
+    crashes = [crash(f"{n}-x", n) for n in range(5)]
 
     def split(places, test):
         return SimpleNamespace(
