@@ -17,9 +17,10 @@ import jsonschema
 import pytest
 
 from crashhunt.base.codec import OMIT_DEFAULT, Serializable, null_is
+from crashhunt.base.json_schema import describe_type, json_schema
 from crashhunt.cli import make_parser
 from crashhunt.guide import find_page
-from crashhunt.guide._schemas import SCHEMAS, describe_schemas, describe_type, json_schema
+from crashhunt.guide._schemas import SCHEMAS, describe_schemas
 from crashhunt.trial import Outcome
 
 
