@@ -102,24 +102,17 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class EndedRun:
-    """A run that has ended, with its recording.
+    """A run that has ended, with its recording."""
 
-    Args:
-        place: index of the run's specification among the specifications of the call.
-        result: result of the trial.
-        recording: recording of the trial; None if it was not requested, or if the process died before it could record.
-        folder: folder with the files of the trial; it exists until the next run is requested.
-        entered: ids of all actors that entered, if the specification requested them (`EVERYBODY`).
-        responses: responses of the reference driver, if the specification has one; None if the trial reported none.
-        lights: contents of `layout.LIGHTS`; empty if the run was not to read the lights, or its simulator has none.
-    """
-
-    place: int
-    result: TrialResult
+    place: int  # index of the run's specification among the specifications of the call
+    result: TrialResult  # result of the trial
+    # recording of the trial; None if it was not requested, or if the process died before it could record
     recording: Recording | None
-    folder: Path
-    entered: tuple[str, ...] = ()
+    folder: Path  # folder with the files of the trial; it exists until the next run is requested
+    entered: tuple[str, ...] = ()  # ids of all actors that entered, if the specification requested them (`EVERYBODY`)
+    # responses of the reference driver, if the specification has one; None if the trial reported none
     responses: tuple[JsonObject, ...] | None = None
+    # contents of `layout.LIGHTS`; empty if the run was not to read the lights, or its simulator has none
     lights: bytes = b""
 
     @property

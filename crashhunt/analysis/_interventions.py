@@ -48,13 +48,9 @@ class Intervention(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetArguments:
-    """Other values of arguments and disturbances from the start, as with ``replay --set``.
+    """Other values of arguments and disturbances from the start, as with ``replay --set``."""
 
-    Args:
-        changes: new value by name, ``NAME`` or ``AGENT.NAME``. The engine passes the values to `prepare`, which checks
-            them.
-    """
-
+    # new value by name, ``NAME`` or ``AGENT.NAME``. The engine passes the values to `prepare`, which checks them.
     changes: Mapping[str, str]
 
     @property

@@ -242,15 +242,11 @@ _PROBE_S: Final = 60.0  # as long as a module may take to import
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """The contents of a shared library with the C interface of agents.
+    """The contents of a shared library with the C interface of agents."""
 
-    Args:
-        declaration: the text of its ``CRASHHUNT_AGENT(...)``, which is JSON.
-        dependencies: the libraries that it needs and that do not belong to the operating system. Each one follows those
-            that it needs itself.
-    """
-
-    declaration: str
+    declaration: str  # the text of its ``CRASHHUNT_AGENT(...)``, which is JSON
+    # the libraries that it needs and that do not belong to the operating system. Each one follows those that it needs
+    # itself.
     dependencies: tuple[Path, ...]
 
 

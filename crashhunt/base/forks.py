@@ -59,15 +59,10 @@ _CHECK_EVERY_S = 0.2  # the same, of one whose answer is awaited
 
 @dataclass(frozen=True, slots=True)
 class NoAnswer:
-    """The reason why a fork returned no answer.
+    """The reason why a fork returned no answer."""
 
-    Args:
-        why: the reason as a clause without a subject, such as "was killed by SIGKILL".
-        is_from_outside: whether another process or the system may be the cause, so that another fork may return an
-            answer.
-    """
-
-    why: str
+    why: str  # the reason as a clause without a subject, such as "was killed by SIGKILL"
+    # whether another process or the system may be the cause, so that another fork may return an answer
     is_from_outside: bool = False
 
 

@@ -113,24 +113,17 @@ def is_foreign_module(name: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ImportedModules:
-    """The modules that a process has imported, whose files a snapshot contains.
+    """The modules that a process has imported, whose files a snapshot contains."""
 
-    Args:
-        places: file of each top-level module, and its folders if it is a package.
-        path: the folders from which modules are imported.
-        named: the top-level modules that were imported explicitly by name.
-        agents: the files of the modules that contain agents.
-        variables: the environment variables, which modules may have changed.
-        read: the files that the modules have read when they were imported, including their own.
-        revisions: version of the sources of agents that are programs, by locator, as they report it.
-    """
-
+    # file of each top-level module, and its folders if it is a package
     places: Mapping[str, tuple[str | None, tuple[str, ...]]]
-    path: tuple[str, ...] = ()
-    named: frozenset[str] = frozenset()
-    agents: tuple[str, ...] = ()
+    path: tuple[str, ...] = ()  # the folders from which modules are imported
+    named: frozenset[str] = frozenset()  # the top-level modules that were imported explicitly by name
+    agents: tuple[str, ...] = ()  # the files of the modules that contain agents
+    # the environment variables, which modules may have changed
     variables: Mapping[str, str] = field(default_factory=dict)
-    read: tuple[str, ...] = ()
+    read: tuple[str, ...] = ()  # the files that the modules have read when they were imported, including their own
+    # version of the sources of agents that are programs, by locator, as they report it
     revisions: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod

@@ -148,15 +148,11 @@ _LIMITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Attribution:
-    """The agent that caused an exception, and how.
+    """The agent that caused an exception, and how."""
 
-    Args:
-        agent: identifier of the agent; empty if one of several agents caused the exception, but it is unknown which.
-        cause: the action by which the agent made another part fail, as a clause; empty if the agent's own code raised
-            the exception.
-    """
-
-    agent: str
+    agent: str  # identifier of the agent; empty if one of several agents caused the exception, but it is unknown which
+    # the action by which the agent made another part fail, as a clause; empty if the agent's own code raised the
+    # exception
     cause: str = ""
 
 

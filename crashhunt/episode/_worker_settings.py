@@ -39,51 +39,38 @@ _SCHEMA = 1  # a replay starts the crashhunt of a snapshot, which may be another
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerSettings(Serializable):
-    """Everything that a worker needs to run the trials of one hunt; it is sent to other processes.
+    """Everything that a worker needs to run the trials of one hunt; it is sent to other processes."""
 
-    Args:
-        scenario: scenario of the trials.
-        oracles: the oracles that detect crashes, each as in ``--oracle``.
-        crash_on: the outcomes that end a trial as a crash.
-        scratch: the folder into which workers write black boxes and output while trials run.
-        code: folders whose modules take precedence over installed modules, the first folder first: those of the
-            snapshot. Empty for none.
-        argument_files: The file of the snapshot for each argument value that names a file.
-        timeout_s: wall-clock limit of a trial, in s.
-        keep_trials: whether the scratch folder of every trial is kept, not only of crashes.
-        sealed: for an untrusted crash, the files that the process may read in addition to installed packages and its
-            scratch folder. The process may write only in the scratch folder. With None, the process has no
-            restrictions.
-        find_escapes: whether the trial confirms a crash: further runs find the last step at which braking avoids a
-            collision, and lights and routes are recorded for its picture. Only in a new process.
-        audit: the share of trials without a crash whose scratch folder is kept, because they are run again.
-        hunt_seed: seed of the hunt, which determines the audited trials.
-        warm_copies: number of traffic seeds for which a worker keeps a suspended fork after the warm-up; 0 for none.
-        probe_s: time between two probes of a trial, in s of simulation time; 0 for no probes.
-        branch: The rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches.
-        force: The rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for
-            none.
-        step_timeout_s: wall-clock limit of each action of a program, a library or an FMU, in s; 0 for none.
-        reuses: identifiers of the vehicles whose program drives in one trial after another.
-    """
-
-    scenario: Scenario
-    oracles: tuple[str, ...]
-    crash_on: tuple[Outcome, ...]
-    scratch: Path
+    scenario: Scenario  # scenario of the trials
+    oracles: tuple[str, ...]  # the oracles that detect crashes, each as in ``--oracle``
+    crash_on: tuple[Outcome, ...]  # the outcomes that end a trial as a crash
+    scratch: Path  # the folder into which workers write black boxes and output while trials run
+    # folders whose modules take precedence over installed modules, the first folder first: those of the snapshot. Empty
+    # for none.
     code: tuple[str, ...] = ()
+    # the file of the snapshot for each argument value that names a file
     argument_files: dict[str, str] = field(default_factory=dict)
-    timeout_s: float = _TIMEOUT_S
-    keep_trials: bool = False
+    timeout_s: float = _TIMEOUT_S  # wall-clock limit of a trial, in s
+    keep_trials: bool = False  # whether the scratch folder of every trial is kept, not only of crashes
+    # for an untrusted crash, the files that the process may read in addition to installed packages and its scratch
+    # folder. The process may write only in the scratch folder. With None, the process has no restrictions.
     sealed: tuple[str, ...] | None = field(default=None, metadata=ESSENTIAL)
+    # whether the trial confirms a crash: further runs find the last step at which braking avoids a collision, and
+    # lights and routes are recorded for its picture. Only in a new process.
     find_escapes: bool = False
-    audit: float = 0.0
-    hunt_seed: int = 0
+    audit: float = 0.0  # the share of trials without a crash whose scratch folder is kept, because they are run again
+    hunt_seed: int = 0  # seed of the hunt, which determines the audited trials
+    # number of traffic seeds for which a worker keeps a suspended fork after the warm-up; 0 for none
     warm_copies: int = field(default=0, metadata=OMIT_DEFAULT)
+    # time between two probes of a trial, in s of simulation time; 0 for no probes
     probe_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
+    # the rates of disturbances in branches, each as ``NAME=RATE``; empty for no branches
     branch: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    # the rates of disturbances in forks with a forced first disturbance, each as ``NAME=RATE``; empty for none
     force: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    # wall-clock limit of each action of a program, a library or an FMU, in s; 0 for none
     step_timeout_s: float = field(default=0.0, metadata=OMIT_DEFAULT)
+    # identifiers of the vehicles whose program drives in one trial after another
     reuses: tuple[str, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
     json_keys: ClassVar[tuple[str, ...]] = (

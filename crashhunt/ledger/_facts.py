@@ -79,92 +79,63 @@ class CodeVersionsData(TypedDict):
 
 
 class Noted(TypedDict, total=False):
-    """The facts about a hunt that are recorded in addition to its state; setting a fact to None removes it.
+    """The facts about a hunt that are recorded in addition to its state; setting a fact to None removes it."""
 
-    Args:
-        owner: the process that runs the hunt; None while no process runs it.
-        began: time at which the hunt was started or resumed, in s since the epoch.
-        heartbeat: time of the last sign of life of the hunt, in s since the epoch.
-        elapsed_s: duration of this run of the hunt up to that sign of life, in s, by the monotonic clock.
-        done_before: number of trials that had ended at the start of this run.
-        planned: number of planned trials; 0 if only the time is limited.
-        replanned: whether the number of planned trials was changed after some trials had ended.
-        until: time at which the hunt's time limit ends, in s since the epoch; None if there is no time limit.
-        hunt_seed: seed from which the trials of the hunt are drawn.
-        independent: whether the trials were drawn independently of each other.
-        plain_origin: origin of the independent trials, if the sampler also draws some trials that it does not guide;
-            else None.
-        lag: maximum number of trials by which results reach a learning sampler late.
-        sampler_version: version of the proposals of a learning sampler; None for other samplers.
-        origins: whether the sampler reports the origin of each trial.
-        core: whether the compiled core of the simulator is used; None if the simulator has no compiled core.
-        notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
-            None if there is nothing.
-        disturb: disturbances of the trials with their rates; None without disturbances.
-        copies: the types of forks that the hunt makes of its trials: ``probes``, ``branches`` or both; None if the hunt
-            makes no forks.
-        confirmed: for ``probes`` and ``branches``: number of crashes of forks that were run from the start to the end,
-            and number of these crashes that were confirmed.
-        nodes: the machines of the last run, if there were several, each with the fields of `NodeFigures`.
-        kinds: the crash types, the most frequent first, if the hunt collects all crash types.
-        kinds_version: version of the rules that decide which crashes are of the same type.
-        types_by_cause: number of crash types by cause, if the hunt counts causes.
-        crash_on: the outcomes that count as a crash.
-        dropped: trials of each crash type (in words) whose bundles were not kept because shorter crashes were kept.
-        dropped_at_fault: those of the trials in `dropped` whose crashes are the agent's fault, if the hunt determines
-            the fault.
-        dropped_judged: the judged crashes among the trials in `dropped`, by crash type (in words) and number of the
-            trial. Each has its cause, and the features that compare it with other crashes. None if there are none.
-        newest_kind: time at which the last new crash type was found, in s since the epoch; None if there is none, or if
-            it is unknown.
-        audits_left: the trials that the audit has not yet run again; None if there are none.
-        phase: phase of the hunt after its last trial, with the fields of `PhaseStatus`; None before the first
-            phase and at the end.
-        ends_at: time at which the last trial is expected to end, in s since the epoch; None if it is unknown.
-        failed_steps: number of simulated steps of confirmations that failed.
-        until_rate: the progress towards a threshold: ``bar`` (the threshold as the user gave it), ``decided_at``
-            (number of the deciding trial) and ``verdict``; None if the hunt has no threshold.
-        running_rate: the current crash rate; None if no rate is known.
-        under_way: the greatest number of trials that were under way at a time, running or queued.
-        code_versions: the versions of the code; None if all trials ran with the same code.
-    """
-
-    owner: HuntOwner | None
-    began: float
-    heartbeat: float
-    elapsed_s: float
-    done_before: int
-    planned: int
-    replanned: bool | None
+    owner: HuntOwner | None  # the process that runs the hunt; None while no process runs it
+    began: float  # time at which the hunt was started or resumed, in s since the epoch
+    heartbeat: float  # time of the last sign of life of the hunt, in s since the epoch
+    elapsed_s: float  # duration of this run of the hunt up to that sign of life, in s, by the monotonic clock
+    done_before: int  # number of trials that had ended at the start of this run
+    planned: int  # number of planned trials; 0 if only the time is limited
+    replanned: bool | None  # whether the number of planned trials was changed after some trials had ended
+    # time at which the hunt's time limit ends, in s since the epoch; None if there is no time limit
     until: float | None
-    hunt_seed: int
-    independent: bool
+    hunt_seed: int  # seed from which the trials of the hunt are drawn
+    independent: bool  # whether the trials were drawn independently of each other
+    # origin of the independent trials, if the sampler also draws some trials that it does not guide; else None
     plain_origin: str | None
-    lag: int | None
-    sampler_version: int | None
-    origins: bool
-    core: str | None
+    lag: int | None  # maximum number of trials by which results reach a learning sampler late
+    sampler_version: int | None  # version of the proposals of a learning sampler; None for other samplers
+    origins: bool  # whether the sampler reports the origin of each trial
+    core: str | None  # whether the compiled core of the simulator is used; None if the simulator has no compiled core
+    # what trials test otherwise than the user's files say, such as demand that the simulator omits; None if there is
+    # nothing
     notices: list[str] | None
-    disturb: list[str] | None
+    disturb: list[str] | None  # disturbances of the trials with their rates; None without disturbances
+    # the types of forks that the hunt makes of its trials: ``probes``, ``branches`` or both; None if the hunt makes no
+    # forks
     copies: list[str] | None
+    # for ``probes`` and ``branches``: number of crashes of forks that were run from the start to the end, and number of
+    # these crashes that were confirmed
     confirmed: Mapping[str, Sequence[int]] | None
+    # the machines of the last run, if there were several, each with the fields of `NodeFigures`
     nodes: list[JsonObject]
-    kinds: list[KindData]
-    kinds_version: int
-    types_by_cause: int
-    crash_on: list[str]
+    kinds: list[KindData]  # the crash types, the most frequent first, if the hunt collects all crash types
+    kinds_version: int  # version of the rules that decide which crashes are of the same type
+    types_by_cause: int  # number of crash types by cause, if the hunt counts causes
+    crash_on: list[str]  # the outcomes that count as a crash
+    # time at which the last new crash type was found, in s since the epoch; None if there is none, or if it is unknown
     newest_kind: float | None
-    audits_left: list[int] | None
+    audits_left: list[int] | None  # the trials that the audit has not yet run again; None if there are none
+    # phase of the hunt after its last trial, with the fields of `PhaseStatus`; None before the first phase and at the
+    # end
     phase: JsonObject | None
+    # time at which the last trial is expected to end, in s since the epoch; None if it is unknown
     ends_at: float | None
-    failed_steps: int
+    failed_steps: int  # number of simulated steps of confirmations that failed
+    # trials of each crash type (in words) whose bundles were not kept because shorter crashes were kept
     dropped: dict[str, list[int]]
+    # those of the trials in `dropped` whose crashes are the agent's fault, if the hunt determines the fault
     dropped_at_fault: list[int]
+    # the judged crashes among the trials in `dropped`, by crash type (in words) and number of the trial. Each has its
+    # cause, and the features that compare it with other crashes. None if there are none.
     dropped_judged: dict[str, dict[str, JsonObject]] | None
+    # the progress towards a threshold: ``bar`` (the threshold as the user gave it), ``decided_at`` (number of the
+    # deciding trial) and ``verdict``; None if the hunt has no threshold
     until_rate: UntilRate | None
-    running_rate: RunningRate | None
-    under_way: int
-    code_versions: CodeVersionsData | None
+    running_rate: RunningRate | None  # the current crash rate; None if no rate is known
+    under_way: int  # the greatest number of trials that were under way at a time, running or queued
+    code_versions: CodeVersionsData | None  # the versions of the code; None if all trials ran with the same code
 
 
 class Facts(Noted, total=False):

@@ -34,15 +34,11 @@ _BY_DANGER = "SELECT outcome, danger, number FROM trials INDEXED BY trials_by_da
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One exchange with a learning sampler: results that it received, then its proposal.
+    """One exchange with a learning sampler: results that it received, then its proposal."""
 
-    Args:
-        told: numbers of the trials whose results the sampler received since its last proposal, in the order of receipt.
-        spec: the trial that the sampler then proposed.
-    """
-
+    # numbers of the trials whose results the sampler received since its last proposal, in the order of receipt
     told: tuple[int, ...]
-    spec: TrialSpec
+    spec: TrialSpec  # the trial that the sampler then proposed
 
 
 class LedgerReader:

@@ -94,15 +94,11 @@ _DIGEST_PLACES = {table: len(columns) for table, columns in COLUMNS.items()} | {
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The columns of the tables of a ledger.
+    """The columns of the tables of a ledger."""
 
-    Args:
-        version: version of the table layout.
-        columns: columns of each table except the digest, in the order in which they are hashed. A table of a newer
-            version may have further columns at its end.
-    """
-
-    version: int
+    version: int  # version of the table layout
+    # columns of each table except the digest, in the order in which they are hashed. A table of a newer version may
+    # have further columns at its end.
     columns: Mapping[str, tuple[str, ...]]
 
     def select(self, table: str) -> str:
@@ -278,13 +274,10 @@ _LOOK_EVERY_S = 1.0  # how late a request to stop waiting may be
 
 
 class PatientConnection(sqlite3.Connection):
-    """A connection that can wait for minutes while another process, such as a backup, locks the file.
+    """A connection that can wait for minutes while another process, such as a backup, locks the file."""
 
-    Attributes:
-        wait: function called about once a second with the time that a statement has waited, in s. It may raise an error
-            to stop waiting. The default waits for ten seconds.
-    """
-
+    # function called about once a second with the time that a statement has waited, in s. It may raise an error to stop
+    # waiting. The default waits for ten seconds.
     wait: Callable[[float], None] | None = None
 
     def execute(self, statement: str, *given: Any) -> sqlite3.Cursor:

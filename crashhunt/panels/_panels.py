@@ -74,16 +74,10 @@ def labelled(nest: object) -> list[tuple[str, Panel]]:
 
 @dataclass(kw_only=True)
 class Panel:
-    """A picture of a part of an agent's internal state.
+    """A picture of a part of an agent's internal state."""
 
-    Args:
-        title: title above the panel; in the label, scopes and keys precede the title.
-
-    Attributes:
-        scopes: names of the scopes in which the panel was created.
-    """
-
-    title: str = ""
+    title: str = ""  # title above the panel; in the label, scopes and keys precede the title
+    # names of the scopes in which the panel was created
     scopes: tuple[str, ...] = field(default_factory=current_scope, init=False, repr=False)
 
     def draw(self, width: int = 240, height: int = 160, label: str = "") -> NDArray[np.uint8]:

@@ -148,19 +148,14 @@ _TRUTHS: dict[str, np.ufunc] = {
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Computes formulas on one trace.
+    """Computes formulas on one trace."""
 
-    Args:
-        leaf: function that returns the values of a formula without temporal operators at each sample.
-        is_leaf: whether `leaf` computes a formula; otherwise its operands are computed.
-        bounds: function that returns the bounds of a window in steps.
-        running: whether the trace may continue. Samples after its end then have the value that is best for the whole
-            formula, so that a false formula stays false with every continuation.
-    """
-
+    # function that returns the values of a formula without temporal operators at each sample
     leaf: Callable[[Formula], NDArray[np.float64]]
-    is_leaf: Callable[[Formula], bool]
-    bounds: Callable[[Window], tuple[int, int | None]]
+    is_leaf: Callable[[Formula], bool]  # whether `leaf` computes a formula; otherwise its operands are computed
+    bounds: Callable[[Window], tuple[int, int | None]]  # function that returns the bounds of a window in steps
+    # whether the trace may continue. Samples after its end then have the value that is best for the whole formula, so
+    # that a false formula stays false with every continuation.
     running: bool = False
 
     def values(self, formula: Formula, *, positive: bool = True) -> NDArray[np.float64]:

@@ -134,69 +134,53 @@ _STATE_BY_REASON: dict[str, State] = {
 
 @dataclass(frozen=True, slots=True)
 class HuntState(Serializable):
-    """The state of a hunt.
+    """The state of a hunt."""
 
-    Args:
-        dir: directory of the hunt.
-        state: the state of the hunt: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (a crash was found),
-            ``error``, ``interrupted`` or ``killed`` (its process ended without recording a reason).
-        detail: the reason of an error.
-        trials_planned: number of planned trials; 0 if only the time is limited.
-        trials_run: number of finished trials.
-        outcomes: number of trials with each outcome.
-        crashes: number of crashes, with or without a bundle.
-        crashes_saved: number of crashes with a bundle, if ``--keep`` has deleted some bundles; else None.
-        errors: number of trials that could not be set up, or ended in a software fault.
-        rate_per_s: trials per second in the last run of the hunt.
-        seconds_left: expected time to the last trial, to the time limit, or to the end of the phase, in s; None if
-            unknown.
-        owner_alive: whether the process of the hunt is running.
-        damaged: whether the ledger of the hunt cannot be read, so that the counts are meaningless.
-        phase: phase of the hunt after its last trial: fields of `PhaseStatus` without the time; None before these
-            phases, and if the hunt is not running.
-        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        probes: present results of the probes; None if the hunt has no probes.
-        branches: present results of the branches; None if the hunt has no branches.
-        rate: the crash rate at the hunt's last heartbeat, with the fields of `RunningRate`; None if it is unknown.
-        core: whether the simulator's compiled core is used; None if the simulator has none.
-        notices: what trials test otherwise than the user's files say, such as demand that the simulator omits;
-            None if there is nothing.
-        nodes: the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine.
-        kinds: crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first
-            crash.
-        newest_kind_s: time from the last new crash type until now, or until the last trial ended, in s; None if it is
-            unknown.
-        types_by_cause: number of crash types by cause; None without ``--by-cause``.
-        code_versions: the trials of each version of the code, with the fields of `VersionCounts`; None if all trials
-            ran with the same code. Crash types and rate are those of the newest version.
-        notes: notes and tags of users on the hunt and on its crashes; None if there are none.
-    """
-
-    dir: str
+    dir: str  # directory of the hunt
+    # the state of the hunt: ``queued``, ``running``, ``finished`` (no crash), ``crashed`` (a crash was found),
+    # ``error``, ``interrupted`` or ``killed`` (its process ended without recording a reason)
     state: State
-    detail: str = ""
-    trials_planned: int = 0
-    trials_run: int = 0
-    outcomes: dict[str, int] = field(default_factory=dict)
-    crashes: int = 0
-    errors: int = 0
-    rate_per_s: float = 0.0
+    detail: str = ""  # the reason of an error
+    trials_planned: int = 0  # number of planned trials; 0 if only the time is limited
+    trials_run: int = 0  # number of finished trials
+    outcomes: dict[str, int] = field(default_factory=dict)  # number of trials with each outcome
+    crashes: int = 0  # number of crashes, with or without a bundle
+    errors: int = 0  # number of trials that could not be set up, or ended in a software fault
+    rate_per_s: float = 0.0  # trials per second in the last run of the hunt
+    # expected time to the last trial, to the time limit, or to the end of the phase, in s; None if unknown
     seconds_left: float | None = None
-    owner_alive: bool = False
-    damaged: bool = False
+    owner_alive: bool = False  # whether the process of the hunt is running
+    damaged: bool = False  # whether the ledger of the hunt cannot be read, so that the counts are meaningless
+    # number of crashes with a bundle, if ``--keep`` has deleted some bundles; else None
     crashes_saved: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    # phase of the hunt after its last trial: fields of `PhaseStatus` without the time; None before these phases, and if
+    # the hunt is not running
     phase: dict[str, Any] | None = field(default=None, metadata=OMIT_DEFAULT)
+    # number of crashes with disturbances; None if the hunt has no disturbances
     disturbed: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    # whether the simulator's compiled core is used; None if the simulator has none
     core: str | None = field(default=None, metadata=OMIT_DEFAULT)
+    # what trials test otherwise than the user's files say, such as demand that the simulator omits; None if there is
+    # nothing
     notices: list[str] | None = field(default=None, metadata=OMIT_DEFAULT)
+    # the machines of the hunt's last run, with the fields of `NodeFigures`; None if it used only this machine
     nodes: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    # crash types, the most frequent first, with the fields of `KindData`; None if the hunt ends at its first crash
     kinds: list[KindData] | None = field(default=None, metadata=OMIT_DEFAULT)
+    # time from the last new crash type until now, or until the last trial ended, in s; None if it is unknown
     newest_kind_s: float | None = field(default=None, metadata=written_if(lambda state: state.kinds is not None))
+    # number of crash types by cause; None without ``--by-cause``
     types_by_cause: int | None = field(default=None, metadata=OMIT_DEFAULT)
+    # present results of the probes; None if the hunt has no probes
     probes: ProbeSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    # present results of the branches; None if the hunt has no branches
     branches: BranchSums | None = field(default=None, metadata=OMIT_DEFAULT)
+    # the crash rate at the hunt's last heartbeat, with the fields of `RunningRate`; None if it is unknown
     rate: RunningRate | None = field(default=None, metadata=OMIT_DEFAULT)
+    # the trials of each version of the code, with the fields of `VersionCounts`; None if all trials ran with the same
+    # code. Crash types and rate are those of the newest version.
     code_versions: list[dict[str, Any]] | None = field(default=None, metadata=OMIT_DEFAULT)
+    # notes and tags of users on the hunt and on its crashes; None if there are none
     notes: list[Note] | None = field(default=None, metadata=OMIT_DEFAULT)
 
     @property

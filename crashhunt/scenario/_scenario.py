@@ -448,15 +448,11 @@ class Accelerator:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompiledCore:
-    """The optional compiled core of a simulator, with bit-identical results.
+    """The optional compiled core of a simulator, with bit-identical results."""
 
-    Args:
-        switched_off: function that returns a scenario with the compiled core disabled, as ``--no-native`` requests.
-        why_not: function that returns why the compiled core is not used, as a text after "not used: "; empty if it is
-            used.
-    """
-
+    # function that returns a scenario with the compiled core disabled, as ``--no-native`` requests
     switched_off: Callable[[Scenario], Scenario]
+    # function that returns why the compiled core is not used, as a text after "not used: "; empty if it is used
     why_not: Callable[[Scenario], str]
 
 
@@ -692,19 +688,15 @@ class SurveyJob(TypedDict):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrafficSurvey:
-    """How a simulator finds the vehicles that an agent can replace: it simulates the traffic before the hunt.
+    """How a simulator finds the vehicles that an agent can replace: it simulates the traffic before the hunt."""
 
-    Args:
-        module: module with a function ``main()``, which runs in its own process; its only argument is the file of a
-            `SurveyJob`.
-        refine: function that returns the scenario with the candidates that the runs confirm, given the output of
-            ``module``. The function raises `ScenarioError` if no trial can be valid.
-        restore: function that returns the scenario with the candidates of an earlier hunt, given that hunt's scenario;
-            None if the hunt drew no candidates.
-    """
-
+    # module with a function ``main()``, which runs in its own process; its only argument is the file of a `SurveyJob`
     module: str
+    # function that returns the scenario with the candidates that the runs confirm, given the output of ``module``. The
+    # function raises `ScenarioError` if no trial can be valid.
     refine: Callable[[Scenario, Json], Scenario]
+    # function that returns the scenario with the candidates of an earlier hunt, given that hunt's scenario; None if the
+    # hunt drew no candidates
     restore: Callable[[Scenario, Scenario], Scenario | None]
 
 

@@ -82,59 +82,46 @@ class Pair(Serializable):
 
     Trials with the same number, seed and traffic are compared in pairs. If there are no such trials, the crash rates of
     the two hunts are compared.
-
-    Args:
-        first: directory of the first hunt.
-        second: directory of the second hunt.
-        trials: number of pairs of valid trials.
-        only_first: pairs in which only the first hunt crashed; with ``--seeds``, traffic seeds in which it crashed more
-            often.
-        only_second: pairs in which only the second hunt crashed; with ``--seeds``, traffic seeds in which it crashed
-            more often.
-        both: pairs in which both hunts crashed; with ``--seeds``, traffic seeds in which both crashed equally often.
-        p_value: *p* value of McNemar's or Fisher's exact test on the crashes per trial; None if the number of trials
-            was not fixed in advance. It decides nothing.
-        caution: a warning that limits the meaning of the answer; empty if there is none.
-        test: basis of the verdict: ``pairs``, the evidence of pairs; ``intervals``, the certain intervals of
-            both hunts; empty if there is none.
-        why_unpaired: reason why there are no pairs; empty if there are pairs.
-        counts: numbers of crashes and of valid trials, of the first hunt and of the second.
-        evidence: e-value against the hypothesis that both hunts crash equally often per trial; 20 or more means 95 %
-            confidence. None without pairs, and for rates per hour or per 1,000 km.
-        difference: interval of the difference of the crash rates in the unit ``per``, second minus first; None if there
-            is none.
-        units: number of independent pairs, of trials or of traffic seeds.
-        excluded: number of trials of both hunts that do not count. A trial does not count if a trial with a lower
-            number has not ended, or if the trial is invalid in both hunts. A trial on whose traffic an agent was
-            trained does not count either.
-        answer: the hunt that certainly crashes less, ``first`` or ``second``; ``undecided`` if neither does; empty if
-            no answer is possible. The answer follows from ``difference``: it is undecided if this interval contains 0.
-        not_started: number of trials of the first hunt and of the second that count as crashes. The agent does not
-            start in these trials, and it starts in the same trials of the other hunt.
-        without_result: number of pairs with an unknown result. A trial was killed from outside or could not be set up,
-            in one hunt only. The answer is valid for any result of these pairs.
-        per: the unit to which answer and difference refer: ``trial``, ``hour`` or ``1000km``.
     """
 
-    first: str
-    second: str
-    trials: int
+    first: str  # directory of the first hunt
+    second: str  # directory of the second hunt
+    trials: int  # number of pairs of valid trials
+    # pairs in which only the first hunt crashed; with ``--seeds``, traffic seeds in which it crashed more often
     only_first: int
+    # pairs in which only the second hunt crashed; with ``--seeds``, traffic seeds in which it crashed more often
     only_second: int
-    both: int
+    both: int  # pairs in which both hunts crashed; with ``--seeds``, traffic seeds in which both crashed equally often
+    # *p* value of McNemar's or Fisher's exact test on the crashes per trial; None if the number of trials was not fixed
+    # in advance. It decides nothing.
     p_value: float | None
-    caution: str = ""
+    caution: str = ""  # a warning that limits the meaning of the answer; empty if there is none
+    # basis of the verdict: ``pairs``, the evidence of pairs; ``intervals``, the certain intervals of both hunts; empty
+    # if there is none
     test: Literal["pairs", "intervals", ""] = "pairs"
-    why_unpaired: str = ""
+    why_unpaired: str = ""  # reason why there are no pairs; empty if there are pairs
+    # numbers of crashes and of valid trials, of the first hunt and of the second
     counts: tuple[int, int, int, int] = (0, 0, 0, 0)
+    # e-value against the hypothesis that both hunts crash equally often per trial; 20 or more means 95 % confidence.
+    # None without pairs, and for rates per hour or per 1,000 km.
     evidence: float | None = field(default=None, metadata=null_is(None))
+    # interval of the difference of the crash rates in the unit ``per``, second minus first; None if there is none
     difference: Interval | None = None
-    units: int = 0
+    units: int = 0  # number of independent pairs, of trials or of traffic seeds
+    # number of trials of both hunts that do not count. A trial does not count if a trial with a lower number has not
+    # ended, or if the trial is invalid in both hunts. A trial on whose traffic an agent was trained does not count
+    # either.
     excluded: int = 0
+    # the hunt that certainly crashes less, ``first`` or ``second``; ``undecided`` if neither does; empty if no answer
+    # is possible. The answer follows from ``difference``: it is undecided if this interval contains 0.
     answer: Answer = ""
+    # number of trials of the first hunt and of the second that count as crashes. The agent does not start in these
+    # trials, and it starts in the same trials of the other hunt.
     not_started: tuple[int, int] = (0, 0)
+    # number of pairs with an unknown result. A trial was killed from outside or could not be set up, in one hunt only.
+    # The answer is valid for any result of these pairs.
     without_result: int = 0
-    per: Per = "trial"
+    per: Per = "trial"  # the unit to which answer and difference refer: ``trial``, ``hour`` or ``1000km``
 
     json_keys = (
         "first", "second", "trials", "only_first", "only_second", "both", "p_value", "caution", "test", "why_unpaired",

@@ -189,13 +189,10 @@ _STEP_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A share of the cases of one or several hunts, with a 95 % interval.
+    """A share of the cases of one or several hunts, with a 95 % interval."""
 
-    Args:
-        counts: for each hunt its number of cases, of random cases, and of random cases that count. If all cases of a
-            hunt ran, all of them are random cases.
-    """
-
+    # for each hunt its number of cases, of random cases, and of random cases that count. If all cases of a hunt ran,
+    # all of them are random cases.
     counts: tuple[tuple[int, int, int], ...]
 
     @property

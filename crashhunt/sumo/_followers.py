@@ -67,15 +67,11 @@ class Piece(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """The part of an outline that is on a lane.
+    """The part of an outline that is on a lane."""
 
-    Args:
-        pieces: the pieces of the lane that the outline touches, each with the outline in the frame of the piece.
-        speed: speed of the agent's vehicle along the lane, in m/s; 0 if it drives against the lane.
-    """
-
+    # the pieces of the lane that the outline touches, each with the outline in the frame of the piece
     pieces: list[tuple[Piece, Polygon]]
-    speed: float
+    speed: float  # speed of the agent's vehicle along the lane, in m/s; 0 if it drives against the lane
 
     def reach(self, right: float, left: float) -> tuple[float, float] | None:
         """Return the positions on the lane, in m, between which the outline is on a path; None if it is not.

@@ -79,18 +79,14 @@ class PathAhead:
 
 
 class _Around(NamedTuple):
-    """The lanes around a vehicle, by their relation to it.
+    """The lanes around a vehicle, by their relation to it."""
 
-    Args:
-        sides: `_LEFT`, `_SAME` or `_RIGHT` of the lanes of the road, and of those that the route continues to.
-        opposite: the lanes in the opposite direction.
-        crossing: the lanes on paths that conflict with the vehicle's path at a junction, and the lanes before them.
-        leading: the side that another lane leads to, or None. A lane is added when it is asked for.
-    """
-
+    # `_LEFT`, `_SAME` or `_RIGHT` of the lanes of the road, and of those that the route continues to
     sides: Mapping[str, int]
-    opposite: frozenset[str]
+    opposite: frozenset[str]  # the lanes in the opposite direction
+    # the lanes on paths that conflict with the vehicle's path at a junction, and the lanes before them
     crossing: frozenset[str]
+    # the side that another lane leads to, or None. A lane is added when it is asked for.
     leading: dict[str, int | None]
 
 

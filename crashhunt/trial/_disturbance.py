@@ -102,29 +102,20 @@ def _in_steps(seconds: float, step_length_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Disturbance(Serializable):
-    """A disturbance: either planned in a trial's specification, or as it really took place.
+    """A disturbance: either planned in a trial's specification, or as it really took place."""
 
-    Args:
-        step: The step in which the disturbance begins, counted from 1.
-        who: The place of the vehicle around the agent when the disturbance begins, one of `CELLS`.
-        what: The kind of the disturbance: one of `KINDS` or `HOLD_KINDS`, or a kind that another simulator adds.
-        how_strong: The strength in the unit of the kind: m/s² of braking, s of delay, or a share of a speed or of a
-            value.
-        how_long: The duration in s of simulation time.
-        agent: The controlled vehicle around which the place is chosen.
-        vehicle: The vehicle that was at the place. The field is empty if the disturbance is only planned, or if no
-            vehicle was at the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
-        strengths: The strength in each step, if it follows an `InputSignal`; ``how_strong`` is then the greatest. The
-            field is empty if the strength is constant, or if the disturbance is only planned.
-    """
-
-    step: int
-    who: str
-    what: str
+    step: int  # the step in which the disturbance begins, counted from 1
+    who: str  # the place of the vehicle around the agent when the disturbance begins, one of `CELLS`
+    what: str  # the kind of the disturbance: one of `KINDS` or `HOLD_KINDS`, or a kind that another simulator adds
+    # the strength in the unit of the kind: m/s² of braking, s of delay, or a share of a speed or of a value
     how_strong: float
-    how_long: float
-    agent: str = ""
+    how_long: float  # the duration in s of simulation time
+    agent: str = ""  # the controlled vehicle around which the place is chosen
+    # The vehicle that was at the place. The field is empty if the disturbance is only planned, or if no vehicle was at
+    # the place. A hold (`HOLD_KINDS`) names its vehicle from the beginning.
     vehicle: str = field(default="", metadata=OMIT_DEFAULT)
+    # The strength in each step, if it follows an `InputSignal`; ``how_strong`` is then the greatest. The field is empty
+    # if the strength is constant, or if the disturbance is only planned.
     strengths: tuple[float, ...] = field(default=(), metadata=OMIT_DEFAULT)
 
     @property

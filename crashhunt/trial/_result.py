@@ -241,21 +241,15 @@ MAX_ROBUSTNESS = 1e300
 
 @dataclass(frozen=True, slots=True)
 class Branch(Serializable):
-    """A branch that crashed, as a specification that repeats the crash from the start.
+    """A branch that crashed, as a specification that repeats the crash from the start."""
 
-    Args:
-        disturbances: The trial's disturbances up to the step of the branch, and the disturbances of the branch.
-        branched: The step after which the branch differs from the trial.
-        outcome: The outcome of the branch.
-        step: The number of the branch's last step.
-        log_likelihood: Natural logarithm of the probability that exactly these disturbances begin in these steps; None
-            if the hunt's models cannot draw them.
-    """
-
+    # the trial's disturbances up to the step of the branch, and the disturbances of the branch
     disturbances: tuple[Disturbance, ...]
-    branched: int
-    outcome: str
-    step: int
+    branched: int  # the step after which the branch differs from the trial
+    outcome: str  # the outcome of the branch
+    step: int  # the number of the branch's last step
+    # natural logarithm of the probability that exactly these disturbances begin in these steps; None if the hunt's
+    # models cannot draw them
     log_likelihood: float | None = field(default=None, metadata=null_is(None))
 
 
@@ -285,58 +279,42 @@ class Branches(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class ForcedCopy(Serializable):
-    """The result of a copy with a forced first disturbance.
+    """The result of a copy with a forced first disturbance."""
 
-    Args:
-        cell: the model and strength of the first disturbance, as in `Forcing.ratios`.
-        onset: step in which the first disturbance begins; with a forced second disturbance, the step in which the
-            second disturbance begins.
-        weight: probability of the disturbances that this copy represents, given the root trial.
-        branched: the step after which the copy was forked from the root trial, or from another copy.
-        crash: the outcome if it counts as a crash in the hunt, else empty.
-        step: the step at which the copy ended.
-        disturbed: whether any disturbance had an effect in the copy.
-        disturbances: if the copy crashed, all disturbances that were planned from the start of the trial.
-        within: conditional probability of this copy, given its first disturbance. The probability is 1 if later
-            disturbances are drawn as usual. With forced second disturbances, it is the probability of the forced second
-            disturbance, or of none.
-        second: the cell (model and strength) of the forced second disturbance; empty if there is none.
-    """
-
-    cell: str
+    cell: str  # the model and strength of the first disturbance, as in `Forcing.ratios`
+    # step in which the first disturbance begins; with a forced second disturbance, the step in which the second
+    # disturbance begins
     onset: int
-    weight: float
-    branched: int
-    crash: str = ""
-    step: int = 0
-    disturbed: bool = True
+    weight: float  # probability of the disturbances that this copy represents, given the root trial
+    branched: int  # the step after which the copy was forked from the root trial, or from another copy
+    crash: str = ""  # the outcome if it counts as a crash in the hunt, else empty
+    step: int = 0  # the step at which the copy ended
+    disturbed: bool = True  # whether any disturbance had an effect in the copy
+    # if the copy crashed, all disturbances that were planned from the start of the trial
     disturbances: tuple[Disturbance, ...] = field(default=(), metadata=OMIT_DEFAULT)
+    # conditional probability of this copy, given its first disturbance. The probability is 1 if later disturbances are
+    # drawn as usual. With forced second disturbances, it is the probability of the forced second disturbance, or of
+    # none.
     within: float = field(default=1.0, metadata=OMIT_DEFAULT)
+    # the cell (model and strength) of the forced second disturbance; empty if there is none
     second: str = field(default="", metadata=OMIT_DEFAULT)
 
 
 @dataclass(frozen=True, slots=True)
 class Forced(Serializable):
-    """The results of the copies of a root trial.
+    """The results of the copies of a root trial."""
 
-    Args:
-        survival: probability that no first disturbance begins before the root trial ends.
-        masses: probability, by cell, that the first disturbance belongs to the cell and begins before the root trial
-            ends.
-        copies: copies in the order of their first disturbances; each copy is followed by its own copies, with a second
-            disturbance.
-        steps: number of simulated steps of the copies.
-        unanswered: number of planned copies without a result.
-        why_unanswered: the reason for the first missing result; empty if no result is missing.
-        may_be_asked_again: whether a reason lies outside of the trial, so that another run may return all results.
-    """
-
-    survival: float
+    survival: float  # probability that no first disturbance begins before the root trial ends
+    # probability, by cell, that the first disturbance belongs to the cell and begins before the root trial ends
     masses: Mapping[str, float]
+    # copies in the order of their first disturbances; each copy is followed by its own copies, with a second
+    # disturbance
     copies: tuple[ForcedCopy, ...] = ()
-    steps: int = 0
-    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)
+    steps: int = 0  # number of simulated steps of the copies
+    unanswered: int = field(default=0, metadata=_NOT_ALL_ANSWERED)  # number of planned copies without a result
+    # the reason for the first missing result; empty if no result is missing
     why_unanswered: str = field(default="", metadata=_NOT_ALL_ANSWERED)
+    # whether a reason lies outside of the trial, so that another run may return all results
     may_be_asked_again: bool = field(default=False, metadata=_NOT_ALL_ANSWERED)
 
     def by_first_onset(self) -> list[tuple[ForcedCopy, ...]]:

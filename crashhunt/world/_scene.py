@@ -149,21 +149,15 @@ _NOT_COMPUTED: Any = None  # in place of what is made of the core's columns when
 
 
 class Frame(NamedTuple):
-    """Consecutive scenes with the same actors, as plain columns.
+    """Consecutive scenes with the same actors, as plain columns."""
 
-    Args:
-        roster: the actors of all scenes.
-        columns: float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds.
-        heights: float64, shape (scenes, 2 n): all heights, then all grades; None if the map is flat.
-        spines: spines of each scene; None if no long vehicle is in a bend.
-        core: compiled core that computes with the scene, if there is one; results are bit-identical.
-    """
-
-    roster: Roster
+    roster: Roster  # the actors of all scenes
+    # float64, shape (scenes, 4 n): x and y alternating, then all headings, then all speeds
     columns: NDArray[np.float64]
+    # float64, shape (scenes, 2 n): all heights, then all grades; None if the map is flat
     heights: NDArray[np.float64] | None = None
-    spines: tuple[Mapping[int, Spine], ...] | None = None
-    core: Core | None = None
+    spines: tuple[Mapping[int, Spine], ...] | None = None  # spines of each scene; None if no long vehicle is in a bend
+    core: Core | None = None  # compiled core that computes with the scene, if there is one; results are bit-identical
 
     def scene(self, number: int) -> Scene:
         """Return one of the scenes as a `Scene` whose time is not set."""

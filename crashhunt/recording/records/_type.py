@@ -67,29 +67,22 @@ class BytesForm(Form):
 
 @dataclass(frozen=True, slots=True)
 class RecordType:
-    """The properties of a record type.
+    """The properties of a record type."""
 
-    Args:
-        tag: unique number of the type in the black box; types from `FIRST_ASIDE` on do not belong to the digest.
-        name: name for users, and for the place of a value.
-        topic: topic of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's
-            ``aux``.
-        form: the conversion to a message. Types after the first eleven are text or bytes, so that a version of
-            crashhunt that does not know the type can read the record and include it in the digest.
-        read: function that adds a record, given as ``aux`` and payload, to the `Reading`.
-        difference: function that returns the first difference between the records of two equal steps; for one agent if
-            the topic contains ``{agent}``. The function is None if the record is never compared, or is compared with
-            another type.
-        value: function that returns the value of the agent or actor of a divergence, or the value at an index, in the
-            steps around the divergence.
-    """
-
-    tag: int
-    name: str
+    tag: int  # unique number of the type in the black box; types from `FIRST_ASIDE` on do not belong to the digest
+    name: str  # name for users, and for the place of a value
+    # topic of its messages in a log; ``{agent}`` is replaced by the agent whose number is the record's ``aux``
     topic: str
+    # the conversion to a message. Types after the first eleven are text or bytes, so that a version of crashhunt that
+    # does not know the type can read the record and include it in the digest.
     form: Form
+    # function that adds a record, given as ``aux`` and payload, to the `Reading`
     read: Callable[[Reading, int, bytes], None]
+    # function that returns the first difference between the records of two equal steps; for one agent if the topic
+    # contains ``{agent}``. The function is None if the record is never compared, or is compared with another type.
     difference: Difference | None = None
+    # function that returns the value of the agent or actor of a divergence, or the value at an index, in the steps
+    # around the divergence
     value: Callable[[StepRecord, str, tuple[int, ...]], object] | None = None
 
     @property

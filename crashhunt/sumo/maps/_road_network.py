@@ -91,27 +91,19 @@ class Junction:
 
 @dataclass(slots=True)
 class RoadNetwork:
-    """A road network. Roads and the lanes inside junctions are apart.
+    """A road network. Roads and the lanes inside junctions are apart."""
 
-    Args:
-        edges: edges by id, in the order of the file.
-        junctions: number of junctions of each type; ends of roads are not counted.
-        crossings: number of pedestrian crossings.
-        left_hand: whether traffic drives on the left.
-        areas: the outlines of junctions, in m.
-        inside: paths across junctions and crossings as edges, by id; empty if they were not read.
-        connections: the connections of all lanes; empty if they were not read.
-        rules: the junctions by id; empty if they were not read.
-    """
-
-    edges: dict[str, Edge] = field(default_factory=dict)
+    edges: dict[str, Edge] = field(default_factory=dict)  # edges by id, in the order of the file
+    # number of junctions of each type; ends of roads are not counted
     junctions: Counter[str] = field(default_factory=Counter)
-    crossings: int = 0
-    left_hand: bool = False
-    areas: list[tuple[Point, ...]] = field(default_factory=list)
+    crossings: int = 0  # number of pedestrian crossings
+    left_hand: bool = False  # whether traffic drives on the left
+    areas: list[tuple[Point, ...]] = field(default_factory=list)  # the outlines of junctions, in m
+    # paths across junctions and crossings as edges, by id; empty if they were not read
     inside: dict[str, Edge] = field(default_factory=dict)
+    # the connections of all lanes; empty if they were not read
     connections: list[Connection] = field(default_factory=list)
-    rules: dict[str, Junction] = field(default_factory=dict)
+    rules: dict[str, Junction] = field(default_factory=dict)  # the junctions by id; empty if they were not read
 
     def drivable(self) -> list[Edge]:
         """Return the roads that cars may use."""
