@@ -115,11 +115,7 @@ class CrashList:
         return row
 
     def _read(self, folder: Path) -> Bundle:
-        """Read a bundle of the hunt.
-
-        Raises:
-            BundleError: the bundle is damaged, or a file of the bundle or the hunt must not be opened.
-        """
+        """Read a bundle of the hunt."""
         root = self._found.path
         why = (
             unreadable(folder.parent, root, [folder.name])

@@ -142,11 +142,7 @@ def modifiers_of(words: Iterable[str]) -> dict[str, float]:
 
 
 def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
-    """Return the name and the value of a setting.
-
-    Raises:
-        UsageError: The setting does not exist, or its value is out of range.
-    """
+    """Return the name and the value of a setting."""
     name, _, digits = text.partition("=")
     known = {setting.name: setting for setting in part.settings}
     if name not in known:

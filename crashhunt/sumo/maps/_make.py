@@ -98,11 +98,7 @@ def cached_scenario(path: Path) -> Path:
 
 
 def _cache_folder() -> Path:
-    """Return the cache folder, to which only this user has access.
-
-    Raises:
-        HuntDirectoryError: the folder belongs to another user, other users may write into it, or it cannot be created.
-    """
+    """Return the cache folder, to which only this user has access."""
     home = os.environ.get("XDG_CACHE_HOME", "")
     fix = "set XDG_CACHE_HOME to a folder of your own, or make the scenario yourself: crashhunt init DIR"
     try:
