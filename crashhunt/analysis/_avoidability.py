@@ -165,7 +165,11 @@ class AvoidanceSearch:
             self._run_after_steps(tries, left[: self._parallel])
 
     def _run_after_steps(self, tries: _Tries, steps: Iterable[int]) -> None:
-        """Run the manoeuvre after each of some steps."""
+        """Run the manoeuvre after each of some steps.
+
+        Raises:
+            _Enough: no further runs are allowed.
+        """
         new = sorted(step for step in steps if step not in tries.endings)
         new = new[: max(0, min(self._left, tries.most - len(tries.endings)))]
         if not new:
@@ -303,7 +307,11 @@ def judge_bundle(
 
 
 def _require_judgeable(bundle: Bundle, *, of_two: bool, why: int) -> None:
-    """Check that some run of the analysis is possible."""
+    """Check that some run of the analysis is possible.
+
+    Raises:
+        UsageError: no run is possible.
+    """
     outcome = bundle.result.outcome
     if bundle.is_near_miss:
         raise UsageError(f"{bundle.id} is a near miss, not a crash", fix="give a crash")

@@ -230,7 +230,11 @@ class _Runs:
         return places
 
     def _counted(self, number: int, ended: EndedRun) -> Run:
-        """Return how a run ended, and whether the run counts."""
+        """Return how a run ended, and whether the run counts.
+
+        Raises:
+            UsageError: the changed trial cannot be set up; all other runs would fail in the same way.
+        """
         result = ended.result
         if result.outcome is Outcome.INVALID and not result.was_killed_from_outside:
             message = result.failure.message if result.failure else "its trial could not be set up"

@@ -269,6 +269,9 @@ def _files_of_library(locator: str) -> dict[str, Path]:
     """Return the files that must travel with a library, by the text that names them, in the order to load them.
 
     The text for a library that the agent's library needs is ``lib:`` and its path.
+
+    Raises:
+        PluginError: the library cannot be used.
     """
     path = library_file(locator)
     found = {f"{_LIBRARY_PREFIX}{one}": one for one in describe_library(locator, path).dependencies}
@@ -314,7 +317,11 @@ def load_order(locator: str, files: Mapping[str, str]) -> list[Path]:
 
 @cache
 def _probed(path: Path, *_version: int) -> Library:
-    """Return the contents of a library."""
+    """Return the contents of a library.
+
+    Raises:
+        PluginError: the library cannot be used.
+    """
     import subprocess
 
     command = [sys.executable, "-P", "-I", "-S", library_probe.__file__, str(path)]
@@ -345,7 +352,11 @@ _FMU_FIX = "give the path of an FMU, such as fmu:./planner.fmu"
 
 
 def _files_of_fmu(locator: str) -> dict[str, Path]:
-    """Return the FMU and its table of variables, by the text that names them."""
+    """Return the FMU and its table of variables, by the text that names them.
+
+    Raises:
+        PluginError: the FMU does not exist.
+    """
     word = locator.removeprefix(_FMU_PREFIX)
     path = Path(word).absolute()
     if not word or not path.is_file():

@@ -187,7 +187,11 @@ def truth_of(value: object, what: str, fix: str) -> bool:
 
 
 def _only_element(value: Any) -> Any:
-    """Return the number that a value contains."""
+    """Return the number that a value contains.
+
+    Raises:
+        TypeError: The value is no number, and no array with a number as its only element.
+    """
     for _ in range(_MAX_NESTING):
         if isinstance(value, Real | Decimal):
             return value

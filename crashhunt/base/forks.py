@@ -403,7 +403,11 @@ _CLOSE, _NOTHING, _READ, _OWN = range(4)  # what a fork does with a descriptor: 
 
 
 def _replacements(known: Held, keeps: Collection[int]) -> list[tuple[int, int, int]]:
-    """Return for each file descriptor what a fork does with it, and the current file position."""
+    """Return for each file descriptor what a fork does with it, and the current file position.
+
+    Raises:
+        CannotForkError: a file descriptor, a thread, a child process or shared memory cannot be copied.
+    """
     own = {str(threading.get_native_id())}
     others = len(threads() - watchdog.threads - known.threads - own)
     if others > 0:

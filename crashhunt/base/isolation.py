@@ -213,7 +213,11 @@ class _Keeper(Copy):
 
 
 def _keeper_of(answer: Callable[[], Plain], timeout_s: float, keeps: Collection[int] = ()) -> _Keeper:
-    """Fork a keeper, which forks the process that does the work."""
+    """Fork a keeper, which forks the process that does the work.
+
+    Raises:
+        CannotForkError: this process cannot be forked.
+    """
     owner = os.getpid()
 
     def keep() -> Plain:
@@ -238,7 +242,12 @@ def _is_embedded() -> bool:
 
 
 def _result(answered: Any, keeper: Copy, task: str, fix: str) -> Plain:
-    """Return the result from an answer."""
+    """Return the result from an answer.
+
+    Raises:
+        CrashhuntError: the work raised this error.
+        PluginError: the answer contains no result.
+    """
     if isinstance(answered, dict) and "result" in answered:
         result: Plain = answered["result"]
         return result

@@ -245,6 +245,9 @@ def _spell_out(words: Sequence[str]) -> list[str]:
 
     ``--bbox=-122.3,…`` replaces ``--bbox -122.3,…``, whose second word argparse takes for an option. ``list
     agents`` replaces ``agents``.
+
+    Raises:
+        UsageError: a word is of an earlier version.
     """
     refuse_removed_words(words)
     if "--bbox" in words[:-1]:

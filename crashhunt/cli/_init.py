@@ -141,7 +141,11 @@ def _source(options: Options) -> MapSource:
 
 
 def _demand(text: str) -> tuple[float, float]:
-    """Return the range of traffic factors in a text."""
+    """Return the range of traffic factors in a text.
+
+    Raises:
+        UsageError: the text is not a range.
+    """
     fix = "give two factors above 0, such as --demand 0.2:1.5"
     low, colon, high = text.partition(":")
     try:
@@ -160,7 +164,12 @@ _IMPORT_S = 60.0
 
 
 def _check_agent(name: str) -> None:
-    """Refuse an agent that no trial could create, before the time-consuming work on the map."""
+    """Refuse an agent that no trial could create, before the time-consuming work on the map.
+
+    Raises:
+        PluginError: the agent does not exist, or its module cannot be imported.
+        UsageError: the agent needs an argument.
+    """
     from crashhunt.base.isolation import work_apart
     from crashhunt.base.plugins import is_foreign, locate
     from crashhunt.trial import Signature, signature_of
@@ -178,7 +187,11 @@ def _check_agent(name: str) -> None:
 
 
 def _run_one_trial(folder: Path, steps: int) -> PlainTrial:
-    """Run one trial in the new scenario, and return its result."""
+    """Run one trial in the new scenario, and return its result.
+
+    Raises:
+        NoValidTrialError: the controlled vehicle does not enter.
+    """
     from crashhunt.api import run
     from crashhunt.base.temporary import temporary_folder
     from crashhunt.sumo.maps import PlainTrial

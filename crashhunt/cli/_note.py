@@ -116,7 +116,12 @@ def _removed(options: Options, hunt: Path, crash: str) -> list[Note]:
 
 
 def _subject(options: Options) -> tuple[Path, str]:
-    """Return the directory of the hunt to change, and the name of the crash; empty for the whole hunt."""
+    """Return the directory of the hunt to change, and the name of the crash; empty for the whole hunt.
+
+    Raises:
+        BundleError: the crash does not exist.
+        UsageError: the place cannot have notes.
+    """
     from crashhunt.crashes import find_bundle, subject_of
     from crashhunt.results import find_hunts
 

@@ -71,7 +71,11 @@ def _trust(options: Options, _words: list[str]) -> int:
 
 
 def _trust_place(place: Path) -> list[TrustedOrigin]:
-    """Trust all code at a place that the user has named."""
+    """Trust all code at a place that the user has named.
+
+    Raises:
+        BundleError: the place has no code to run, or is damaged.
+    """
     from crashhunt.base.git import work_tree
     from crashhunt.corpus import find_cases
     from crashhunt.crashes import open_archive, trust_repository

@@ -156,7 +156,11 @@ def _folders_of_kept(cases: Sequence[Path], keep: Path) -> dict[Path, Path]:
 
 
 def _refuse_untrusted_cases(cases: Sequence[Path]) -> None:
-    """Refuse cases that are neither made by this user nor trusted; unreadable cases cannot run anyway."""
+    """Refuse cases that are neither made by this user nor trusted; unreadable cases cannot run anyway.
+
+    Raises:
+        UntrustedError: A case is not trusted; the message names the first such case.
+    """
     for path in cases:
         bundle = untrusted_case(path)
         if bundle is not None:
@@ -180,6 +184,9 @@ def _run_case(path: Path, keep: Path | None, stopped: Callable[[], bool]) -> Cas
     """Run a case; return its report.
 
     Without ``keep``, no crash is kept.
+
+    Raises:
+        StoppedError: A stop was requested before the end of the case.
     """
     report = CaseReport(path=path, expected="fixed", got="cannot_run")  # an unreadable case never meets its expectation
     try:
@@ -245,7 +252,11 @@ def _scenario(snapshot: Snapshot, settings: HuntSettings) -> Scenario:
 
 
 def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
-    """Return the snapshot of a case after checking it."""
+    """Return the snapshot of a case after checking it.
+
+    Raises:
+        BundleError: The snapshot is damaged; the fix names the repository, because a case has no other copy.
+    """
     try:
         snapshot.verify()
     except BundleError as error:

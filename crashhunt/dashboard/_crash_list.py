@@ -115,7 +115,11 @@ class CrashList:
         return row
 
     def _read(self, folder: Path) -> Bundle:
-        """Read a bundle of the hunt."""
+        """Read a bundle of the hunt.
+
+        Raises:
+            BundleError: the bundle is damaged, or a file of the bundle or the hunt must not be opened.
+        """
         root = self._found.path
         why = (
             unreadable(folder.parent, root, [folder.name])

@@ -136,7 +136,11 @@ def _roots(paths: Sequence[Path], opened: ExitStack) -> tuple[list[Path], dict[s
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens on a host and a port."""
+    """Return a socket that listens on a host and a port.
+
+    Raises:
+        UsageError: the port is in use, not allowed or out of range, or the host is not a host of this machine.
+    """
     if not 0 <= port < 65536:
         raise UsageError(f"--port is {port} (allowed: 0 to 65535)", fix="give a port in that range")
     try:

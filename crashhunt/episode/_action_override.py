@@ -184,7 +184,11 @@ def _steered(simulator: Simulator, agent: str) -> TranslatesMotion | None:
 
 
 def _lane_change(simulator: Simulator, agent: str, side: str) -> object:
-    """Return the action that changes lanes, and that also brakes if the action space allows both at once."""
+    """Return the action that changes lanes, and that also brakes if the action space allows both at once.
+
+    Raises:
+        InvalidEpisodeError: the vehicle has no action for a lane change.
+    """
     form = simulator.actions[agent]
     if tuple(form.names) in (_SPEED_AND_LANE, OVERRIDES_ONLY):
         return 0.0, 1 if side == "left" else -1

@@ -467,7 +467,11 @@ class Episode(Forkable, Ending):
 
 
 def _refuse_without(agent: Agent, method: str, argument: str) -> None:
-    """Check that an agent has a method, and that a call runs it."""
+    """Check that an agent has a method, and that a call runs it.
+
+    Raises:
+        ValueError: the agent has no such method, or a call only returns a coroutine or a generator.
+    """
     found = getattr(agent, method, None)
     if not callable(found):
         raise ValueError(f"it has no method {method}({argument})")
@@ -479,7 +483,11 @@ def _refuse_without(agent: Agent, method: str, argument: str) -> None:
 
 
 def _require_reseeding(simulator: Simulator) -> None:
-    """Check that a simulator's random generators can get another seed."""
+    """Check that a simulator's random generators can get another seed.
+
+    Raises:
+        InvalidEpisodeError: the random generators cannot get another seed.
+    """
     if not supports(simulator, SupportsReseeding):
         raise InvalidEpisodeError("the simulator cannot re-seed its random generators")
     if simulator.why_no_reseeding:
@@ -599,7 +607,11 @@ class FastEpisode(Episode):
             return self._break(error)
 
     def _fail_in_core(self, error: BaseException) -> TrialResult:
-        """End the episode with an exception that has passed through the core."""
+        """End the episode with an exception that has passed through the core.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
         fast = self._fast
         assert fast is not None
         if fast.cannot_record:

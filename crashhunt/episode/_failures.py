@@ -492,6 +492,10 @@ class Ending:
         """End the episode with an exception that the simulator or an agent raised outside the agents' own methods.
 
         Before the first step (``is_set_up``), the trial is invalid.
+
+        Raises:
+            RecorderError: the disk is full.
+            InternalError: the exception is crashhunt's own.
         """
         blamed, found = self._blame(error, place)
         if found is not None:
@@ -506,14 +510,23 @@ class Ending:
         return self._fail(outcome, blamed.error, party=party, place=blamed.place)
 
     def _fail_in_conversion(self, error: BaseException, agent: str) -> TrialResult:
-        """End the episode with an exception that was raised while an agent's action was encoded."""
+        """End the episode with an exception that was raised while an agent's action was encoded.
+
+        Raises:
+            RecorderError: the disk is full.
+            InternalError: the exception is crashhunt's own.
+        """
         # crashhunt raises no other than ordinary exceptions: the rest comes from methods of the agent's object.
         if type(error) is ActionError or not issubclass(type(error), Exception):
             return self._fail(Outcome.AGENT_ERROR, error, agent, place="action conversion")
         return self._break(error)
 
     def _blame(self, error: BaseException, place: str = "") -> tuple[Blame, Attribution | None]:
-        """Return the owner of the code that raised an exception, and the agent if it is an agent's code."""
+        """Return the owner of the code that raised an exception, and the agent if it is an agent's code.
+
+        Raises:
+            RecorderError: the disk is full.
+        """
         blamed = blame(error, self.simulator, place)
         found = self._attribute(blamed.error)
         if found is None and type(blamed.error) is ActionError:  # a refused call, whose error the agent has hidden
@@ -557,7 +570,12 @@ class Ending:
         return result
 
     def _break(self, error: BaseException) -> TrialResult:
-        """End an episode that cannot continue because an oracle, a conversion or crashhunt itself has failed."""
+        """End an episode that cannot continue because an oracle, a conversion or crashhunt itself has failed.
+
+        Raises:
+            RecorderError: the disk is full.
+            InternalError: the exception is crashhunt's own, and no agent is known to have caused it.
+        """
         blamed, found = self._blame(error)
         if found is None and blamed.party is Party.CRASHHUNT and not blamed.is_resource:
             raise internal_error(error, self.spec.number, self.steps) from error

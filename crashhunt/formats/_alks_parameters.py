@@ -242,7 +242,11 @@ def _add_range(name: str, ends: ET.Element | None, step: str | None, found: _Par
 
 
 def _specification(found: _Parameters, name: str, convert: Callable[[float], float]) -> tuple[str, str]:
-    """Return the default of an argument, and its range in the notation of ``--set``, which may be empty."""
+    """Return the default of an argument, and its range in the notation of ``--set``, which may be empty.
+
+    Raises:
+        ValueError: a value is not a number.
+    """
 
     def text(value: str) -> str:
         number = float(value)

@@ -412,7 +412,11 @@ class GymSimulator:
         self.actions: dict[str, ActionForm] = {self._agent: action_form(spaces[1])}
 
     def _number(self, value: object, what: str, fix: str) -> float:
-        """Return a number of the environment; report NaN once per hunt, because no comparison with it holds."""
+        """Return a number of the environment; report NaN once per hunt, because no comparison with it holds.
+
+        Raises:
+            UnusableValueError: the value is neither a bool nor a number.
+        """
         number = number_of(value, what, fix)
         if math.isnan(number):
             words = "NaN is not compared, so such a step is no crash by this value"
@@ -449,7 +453,11 @@ def _named_keys(setup: GymSetup) -> dict[str, str]:
 
 
 def _parts(method: str, returned: Any, wanted: tuple[str, ...]) -> Sequence[Any]:
-    """Return what a method of an environment has returned, after a check that it is what Gymnasium defines."""
+    """Return what a method of an environment has returned, after a check that it is what Gymnasium defines.
+
+    Raises:
+        TypeError: the environment has the interface of the old gym, or its info is not a dictionary.
+    """
     if not isinstance(returned, tuple | list) or len(returned) != len(wanted):
         what = f"{len(returned)} values" if isinstance(returned, tuple | list) else f"one {type(returned).__name__}"
         raise TypeError(f"{method}() returned {what}, but {method}() of Gymnasium returns {', '.join(wanted)}")

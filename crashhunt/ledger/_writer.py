@@ -287,7 +287,11 @@ class Ledger(LedgerReader):
                 self._together_since = time.monotonic()
 
     def _begin_to_write(self) -> None:
-        """Check that the existing contents are intact before the first write."""
+        """Check that the existing contents are intact before the first write.
+
+        Raises:
+            HuntDirectoryError: the contents are damaged, or are of a newer version.
+        """
         if self._shape.version > VERSION:  # its columns are unknown here
             raise HuntDirectoryError(
                 f"the ledger has version {self._shape.version}, but this crashhunt writes version {VERSION}: the "

@@ -160,7 +160,11 @@ def resumed_versions(
 
 
 def _refuse_other_limit(directory: Path, ledger: Ledger, before_s: float, now_s: float) -> None:
-    """Refuse another time limit of trials, if it would change the outcomes of trials that have ended."""
+    """Refuse another time limit of trials, if it would change the outcomes of trials that have ended.
+
+    Raises:
+        HuntDirectoryError: earlier trials hung within the earlier limit, or took longer than the present limit.
+    """
     if now_s == before_s:
         return
     hung = ledger.outcomes().get(Outcome.HANG, 0)

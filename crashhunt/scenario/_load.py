@@ -381,6 +381,10 @@ def _join_commands(data: Plain, where: str, folder: Path) -> None:
     """Replace ``agent = { exec = ["./planner", …] }`` by the locator ``exec:…``, and ``{ lib = "…" }`` by ``lib:…``.
 
     Relative paths of such an agent, and of one that is written as such a locator, begin in the scenario's folder.
+
+    Raises:
+        ScenarioError: the command is not a list of texts, or the path of the library or FMU is not a text.
+        PluginError: the text is not a command line.
     """
     agents = data.get("agents")
     for name, table in agents.items() if isinstance(agents, dict) else ():

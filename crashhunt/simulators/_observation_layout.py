@@ -142,7 +142,11 @@ def modifiers_of(words: Iterable[str]) -> dict[str, float]:
 
 
 def _parse_setting(part: Part, text: str, where: str) -> tuple[str, float]:
-    """Return the name and the value of a setting."""
+    """Return the name and the value of a setting.
+
+    Raises:
+        UsageError: The setting does not exist, or its value is out of range.
+    """
     name, _, digits = text.partition("=")
     known = {setting.name: setting for setting in part.settings}
     if name not in known:

@@ -250,7 +250,11 @@ def _of_bundles(hunt: HuntResults, facts: Facts, by: str) -> dict[int, str]:
 
 
 def _by_argument(by: str, settings: HuntSettings) -> _Division:
-    """Return the division by bins of an argument; the argument's distribution fixes the bins in advance."""
+    """Return the division by bins of an argument; the argument's distribution fixes the bins in advance.
+
+    Raises:
+        UsageError: the argument does not exist, or the number of bins is not allowed.
+    """
     space = settings.space
     names = {f"{agent or 'scenario'}.{name}": (agent, name) for agent, name in space}
     short = {name: key for key, (_, name) in names.items() if sum(name == other for _, other in space) == 1}

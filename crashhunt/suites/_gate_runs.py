@@ -154,7 +154,11 @@ class Gate:
 
 @contextmanager
 def _locked(place: Path) -> Iterator[None]:
-    """Create a folder and lock it against other gates; the lock ends with this process."""
+    """Create a folder and lock it against other gates; the lock ends with this process.
+
+    Raises:
+        HuntDirectoryError: another gate runs there, the folder has other contents, or the folder is not writable.
+    """
     try:
         place.mkdir(exist_ok=True)
         if is_hunt(place) or (not (place / GATE).exists() and any(place.iterdir())):
@@ -405,6 +409,10 @@ class _Run:
         """Raise the error of a hunt that could not run; return whether the gate must start no more hunts.
 
         If HEAD starts in no trial and BASE does, the pairs usually decide before.
+
+        Raises:
+            NoValidTrialError: no trial of the hunt was valid.
+            HuntDirectoryError: the hunt failed for any other reason.
         """
         if paired.is_hopeless:
             self._why = f"{paired.name}: {paired.why_not}"
@@ -505,7 +513,11 @@ class _Run:
 
 
 def _wait_until_free(hunt: Path) -> None:
-    """Wait for the process of a hunt whose gate was killed. The process stops on its own, and saves finished trials."""
+    """Wait for the process of a hunt whose gate was killed. The process stops on its own, and saves finished trials.
+
+    Raises:
+        BusyError: the process still runs after some seconds.
+    """
     deadline = time.monotonic() + _BUSY_S
     while True:
         try:

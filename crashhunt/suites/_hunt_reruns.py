@@ -246,7 +246,11 @@ def _run_copies(
 
 
 def _require_same_request(to: Path, request: RunRequest) -> None:
-    """Check that a directory belongs to the same command, which was killed or interrupted."""
+    """Check that a directory belongs to the same command, which was killed or interrupted.
+
+    Raises:
+        HuntDirectoryError: the directory has other contents, its hunt is running, or its hunt ended in an error.
+    """
     try:
         same = RunRequest.read(to / REQUEST).to_plain() == request.to_plain()
     except HuntDirectoryError:

@@ -118,7 +118,11 @@ def _smaller(bundle: Bundle, budget: int, parallel: int) -> Bundle:
 
 
 def _asking(request: Request, example: Example) -> Request:
-    """Return the request with only the values of an example; an agent may not know all other options."""
+    """Return the request with only the values of an example; an agent may not know all other options.
+
+    Raises:
+        UsageError: the example has an unknown key, or unknown arguments.
+    """
     known = Example.__annotations__
     for key in example:
         if key not in known:

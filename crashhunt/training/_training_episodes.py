@@ -254,7 +254,11 @@ class _Caller:
 
 
 def _require_same(first: _Stage, other: _Stage) -> None:
-    """Refuse crashes on which one policy cannot be trained together."""
+    """Refuse crashes on which one policy cannot be trained together.
+
+    Raises:
+        UsageError: The crashes have different scenarios or spaces.
+    """
     where = f"{first.title} and {other.title}"
     if first.name != other.name:
         raise UsageError(

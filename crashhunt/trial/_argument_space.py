@@ -198,6 +198,9 @@ def _check_range(text: str, low: float, high: float, step: float | None, *, log:
     """Refuse an invalid range.
 
     The message shows ``text``. The other arguments are those of `Range`.
+
+    Raises:
+        ArgumentError: the range is invalid.
     """
     if not (_is_finite(low) and _is_finite(high)):
         raise ArgumentError(f"the range {text!r} has an end that is not finite", fix="give two finite numbers")

@@ -115,7 +115,11 @@ def _copy_map(source: MapSource, folder: Path) -> None:
 
 
 def _unpack_pbf(path: Path, target: Path) -> None:
-    """Convert an OpenStreetMap PBF file to XML, because netconvert does not read PBF."""
+    """Convert an OpenStreetMap PBF file to XML, because netconvert does not read PBF.
+
+    Raises:
+        ScenarioError: osmium is not installed, or the file is damaged.
+    """
     try:
         import osmium
     except ImportError:
@@ -136,7 +140,11 @@ def _keeps_left(path: Path) -> bool:
 
 
 def _check_lengths(path: Path) -> None:
-    """Refuse roads whose length OpenDRIVE forbids. netconvert would convert them to other roads without a message."""
+    """Refuse roads whose length OpenDRIVE forbids. netconvert would convert them to other roads without a message.
+
+    Raises:
+        ScenarioError: the length of a road or a geometry is negative or not a number.
+    """
     data = gzip.decompress(path.read_bytes()) if _is_packed(path) else path.read_bytes()
     for element, text in _LENGTH.findall(data):
         try:

@@ -98,7 +98,11 @@ def cached_scenario(path: Path) -> Path:
 
 
 def _cache_folder() -> Path:
-    """Return the cache folder, to which only this user has access."""
+    """Return the cache folder, to which only this user has access.
+
+    Raises:
+        HuntDirectoryError: the folder belongs to another user, other users may write into it, or it cannot be created.
+    """
     home = os.environ.get("XDG_CACHE_HOME", "")
     fix = "set XDG_CACHE_HOME to a folder of your own, or make the scenario yourself: crashhunt init DIR"
     try:
