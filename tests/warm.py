@@ -69,6 +69,7 @@ _imported: dict[str, dict[str, tuple[types.ModuleType, types.CodeType, dict[str,
 # What crashhunt records of each module before a trial, by the address of the module's dictionary.
 _contents: dict[int, _Contents] = {}
 _BEGIN_WITH = ("crashhunt.executors._fork_server",)
+_ALSO_BEGIN_WITH = {"sumo": ("crashhunt.sumo._traffic_survey",)}
 # What these import as soon as they have read what is to be done.
 _ALL = ("crashhunt.scenario._load", "crashhunt.crashes._last_avoidable_step", "crashhunt.recording._foxglove")
 _GO_ON_WITH = {
@@ -330,7 +331,8 @@ class Forked(Process):
 
 def _simulator_of(job: str) -> str:
     try:
-        scenario = json.loads(Path(job).read_text(encoding="utf-8"))["settings"]["scenario"]
+        said = json.loads(Path(job).read_text(encoding="utf-8"))
+        scenario = said.get("settings", said)["scenario"]  # a survey of the traffic has no other settings
         simulator = scenario.get("simulator", "sumo")  # what is as it is without being said is not written
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return ""
@@ -380,7 +382,7 @@ def _import_ours(simulator: str = "") -> None:
         del sys.modules[name]
     sys.meta_path.insert(0, _Known)
     found: dict[str, tuple[types.ModuleType, types.CodeType, dict[str, bytes]]] = {}
-    for begins_with in _BEGIN_WITH:
+    for begins_with in (*_BEGIN_WITH, *_ALSO_BEGIN_WITH.get(simulator, ())):
         for name in (begins_with, *_GO_ON_WITH[simulator]):
             importlib.import_module(name)
         prepare_ours()
