@@ -21,7 +21,7 @@ from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from small_roads import slow_and_fast
+from small_roads import same_either_way
 
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway.accelerator import Onlooker, _substep_loop, switch_off, switch_on
@@ -50,8 +50,8 @@ def trace(make, change, actions):
 
 
 def both(make, change=lambda env: None, actions=ACTIONS):
-    """The trace without and with the accelerator."""
-    return slow_and_fast(lambda: trace(make, change, actions))
+    """The trace, which is the same without and with the accelerator."""
+    return same_either_way(lambda: trace(make, change, actions))
 
 
 def made(kind=HighwayEnvFast, **config):
@@ -169,8 +169,7 @@ BETWEEN = [
     mostly_nightly(BETWEEN, BETWEEN[::2]),
 )
 def test_change_between_sub_steps_and_observation_is_observed(kind, change):
-    slow, fast = both(lambda: made(kind), change, ACTIONS[:3])
-    assert slow == fast
+    slow = both(lambda: made(kind), change, ACTIONS[:3])
     assert slow != trace(made, lambda env: None, ACTIONS[:3])  # it matters
     assert not isinstance(slow[-1], str)
 
@@ -194,8 +193,7 @@ def test_replaced_observation_sees_what_it_changes(monkeypatch):
         return found
 
     original = None
-    slow, fast = slow_and_fast(drive)
-    assert slow == fast
+    same_either_way(drive)
 
 
 def test_observation_does_not_read_the_road_again(monkeypatch):
@@ -286,8 +284,7 @@ META_ACTIONS = [
     mostly_nightly(META_ACTIONS, META_ACTIONS[::3]),
 )
 def test_meta_actions_have_the_effect_that_they_have_in_highway_env(change):
-    slow, fast = both(made, change)
-    assert slow == fast
+    both(made, change)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -300,8 +297,7 @@ def test_sub_step_that_leads_beyond_all_numbers_counts_once():
             env.step(1)
         return env.steps, [exact(vars(vehicle)) for vehicle in env.road.vehicles]
 
-    slow, fast = slow_and_fast(drive)
-    assert slow == fast
+    same_either_way(drive)
 
 
 def test_meta_action_at_the_end_of_a_lane_is_applied_by_highway_env():
@@ -325,16 +321,14 @@ def test_road_is_read_after_a_step_whose_observation_has_its_own_method():
         env.road.step(0.25)
         return [exact(vars(vehicle)) for vehicle in env.road.vehicles]
 
-    slow, fast = slow_and_fast(drive)
-    assert slow == fast
+    same_either_way(drive)
 
 
 def test_meta_actions_at_the_end_of_a_road_have_the_effect_that_they_have_in_highway_env():
     def change(env):
         env.vehicle.position = np.array([149.0, env.vehicle.position[1]])
 
-    slow, fast = both(lambda: made(MergeEnv), change)
-    assert slow == fast
+    slow = both(lambda: made(MergeEnv), change)
     assert slow[0][1][0]["target_lane_index"] != slow[-1][1][0]["target_lane_index"]
 
 
@@ -364,8 +358,7 @@ def test_change_by_a_vehicle_of_a_user_in_a_sub_step_is_noticed(kind):
     def change(env):
         env.road.vehicles[3].__class__ = kind
 
-    slow, fast = both(made, change)
-    assert slow == fast
+    slow = both(made, change)
     assert not isinstance(slow[-1], str)
     egos_and_others = slow[-1][1]
     assert any("checks" in vehicle or vehicle["crashed"] != exact(False) for vehicle in egos_and_others)
@@ -381,8 +374,7 @@ def test_simulation_of_all_environments_replaced_during_an_episode_changes_the_o
         monkeypatch.undo()
         return found
 
-    slow, fast = slow_and_fast(drive)
-    assert slow == fast
+    slow = same_either_way(drive)
     assert slow != trace(made, lambda env: None, ACTIONS[:3])
 
 
@@ -402,8 +394,7 @@ def test_search_of_a_user_runs_once_for_an_observation(kind):
             vehicle.to_dict = partial(_described_elsewhere, vehicle)  # which highway-env has to call
 
     make = partial(made, ExitEnv if kind == "ExitObservation" else HighwayEnvFast)
-    slow, fast = both(make, change, ACTIONS[:3])
-    assert slow == fast
+    slow = both(make, change, ACTIONS[:3])
     assert not isinstance(slow[-1], str)
 
 
@@ -419,13 +410,11 @@ def test_second_observation_of_an_observation_sees_its_change():
 
         seeing.normalize_obs = change_and_observe
 
-    slow, fast = both(made, change, ACTIONS[:3])
-    assert slow == fast
+    both(made, change, ACTIONS[:3])
 
 
 def test_meta_action_with_an_unusual_name_has_the_effect_that_it_has_in_highway_env():
-    slow, fast = both(made, lambda env: setattr(env.action_type, "actions", {1: ["FASTER"]}), [1, 1])
-    assert slow == fast
+    slow = both(made, lambda env: setattr(env.action_type, "actions", {1: ["FASTER"]}), [1, 1])
     assert not isinstance(slow[-1], str)
 
 
@@ -466,8 +455,7 @@ def test_wrapper_with_the_name_of_the_method_of_a_vehicle_disables_the_accelerat
 
 @pytest.mark.parametrize("action", [7, 1.0, True, np.float64(3), np.array(4), "FASTER", None])
 def test_unusual_action_has_the_effect_that_it_has_in_highway_env(action):
-    slow, fast = both(made, actions=[action, action])
-    assert slow == fast
+    both(made, actions=[action, action])
 
 
 def test_speed_halfway_between_two_target_speeds_is_rounded_as_in_highway_env():
@@ -475,8 +463,7 @@ def test_speed_halfway_between_two_target_speeds_is_rounded_as_in_highway_env():
         env.vehicle.speed = 22.5
 
     for action in (3, 4):
-        slow, fast = both(made, change, [action])
-        assert slow == fast
+        both(made, change, [action])
 
 
 @pytest.mark.parametrize(("owner", "name"), [(DiscreteMetaAction, "act"), (ActionType, "controlled_vehicle")])
@@ -488,8 +475,7 @@ def test_replaced_method_of_meta_actions_is_called(owner, name, monkeypatch):
     else:
         change = property(lambda self: (called.append(1), original.fget(self))[1], original.fset)
         monkeypatch.setattr(owner, name, change)
-    slow, fast = both(made)
-    assert slow == fast
+    both(made)
     assert len(called) >= 2 * len(ACTIONS)
 
 
@@ -515,8 +501,7 @@ def test_rewards_are_those_of_highway_env(speed, kind):
         change(env)
         return exact(env._rewards(1)), exact(env._reward(1))
 
-    slow, fast = slow_and_fast(rewards)
-    assert slow == fast
+    same_either_way(rewards)
 
 
 def test_replaced_clip_limits_the_speed_in_rewards(monkeypatch):

@@ -33,6 +33,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 from hypothesis import example, given, settings, strategies as st
+from small_roads import same_either_way
 
 from crashhunt.highway import _descriptor as highway
 from crashhunt.highway._descriptor import BACKEND
@@ -282,9 +283,7 @@ def grids(seed):
 
 
 def test_times_to_collision_are_those_of_highway_env():
-    slow = list(map(grids, range(3)))
-    assert not switch_on()
-    assert list(map(grids, range(3))) == slow
+    same_either_way(lambda: list(map(grids, range(3))))
     assert _roads.look(crowded(1)) is not None
 
 
@@ -399,9 +398,7 @@ def test_an_error_of_highway_env_leaves_what_highway_env_leaves():
         return found
 
     logging.getLogger("highway_env").setLevel(logging.ERROR)
-    slow = broken()
-    assert not switch_on()
-    assert broken() == slow
+    slow = same_either_way(broken)
     assert any("Error" in found for found in slow if isinstance(found, str))
 
 
@@ -486,9 +483,7 @@ def test_an_action_at_the_limit_of_speed_stays(speed):
         road.step(0.1)
         return state(road)
 
-    slow = moved()
-    assert not switch_on()
-    assert moved() == slow
+    same_either_way(moved)
 
 
 def test_another_vehicle_of_equal_speed_has_no_time_to_collision():
@@ -499,9 +494,7 @@ def test_another_vehicle_of_equal_speed_has_no_time_to_collision():
         env = SimpleNamespace(road=road, vehicle=road.vehicles[0])
         return exact(observation.compute_ttc_grid(env, 0.5, 6, road.vehicles[0]))
 
-    slow = grid()
-    assert not switch_on()
-    assert grid() == slow
+    same_either_way(grid)
 
 
 def test_linear_vehicle_collects_the_same_data():
@@ -516,9 +509,7 @@ def test_linear_vehicle_collects_the_same_data():
             road.step(0.1)
         return [exact(vehicle.data) for vehicle in road.vehicles[:3]], state(road)
 
-    slow = collected()
-    assert not switch_on()
-    assert collected() == slow
+    slow = same_either_way(collected)
     _, outputs = slow[0][0]["lateral"]["outputs"]
     assert len(outputs) == 20
     assert slow[0][1] == {}
@@ -641,6 +632,4 @@ def test_neighbours_at_the_same_distance_stay_in_order_and_objects_behind_are_no
         env = SimpleNamespace(road=road, vehicle=road.vehicles[0], PERCEPTION_DISTANCE=200)
         return exact(observation.KinematicObservation(env, vehicles_count=20, see_behind=True).observe())
 
-    slow = seen()
-    assert not switch_on()
-    assert seen() == slow
+    same_either_way(seen)
