@@ -119,6 +119,11 @@ def test_values_are_converted_between_the_units_of_an_fmu_and_those_of_the_simul
     assert str(unconverted.act(np.zeros_like(seen))[0]) == "-0.0"  # the same bits, which digests contain
 
 
+@pytest.mark.parametrize("unit", ["1", "-"])
+def test_a_variable_without_a_unit_has_that_of_the_simulator(tmp_path, unit):
+    agent_of(build_fmu(tmp_path, 2, description=with_units(f'{KM_H}<Unit name="{unit}"/>', unit, unit)))
+
+
 @pytest.mark.parametrize("base", ['m="2"', 'm="1" rad="1"', 'm="1" kg="1"', 'm="1" factor="0"', ""])
 def test_a_unit_that_cannot_be_converted_is_refused(tmp_path, base):
     definition = f'<Unit name="dm"><BaseUnit {base}/></Unit>' if base else '<Unit name="dm"/>'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from conftest import one_in
 
 from crashhunt.disturbances import ModelApart
-from crashhunt.errors import ArgumentError, HuntDirectoryError, ScenarioError, UsageError
+from crashhunt.errors import ArgumentError, HuntDirectoryError, PluginError, ScenarioError, UsageError
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.plans import (
     Owners,
@@ -27,11 +28,11 @@ from crashhunt.plans import (
     write_settings,
 )  # fmt: skip
 from crashhunt.plans._arguments import _spec
-from crashhunt.plans._code import notes_on_programs
+from crashhunt.plans._code import _check_defaults, notes_on_programs
 from crashhunt.plans._executor_choice import executor_of, parallel_here, sizes_itself
 from crashhunt.scenario import copy_shipped_scenario
 from crashhunt.sumo._options import SumoSetup
-from crashhunt.trial import Argument, parse_spec
+from crashhunt.trial import Argument, CallSignature, parse_spec
 
 EXECUTORS = """
 class Cluster:
@@ -472,6 +473,14 @@ def test_of_a_record_the_code_is_asked_only_where_it_does_not_know():
     assert calls == ["a", "b", "b"]
     assert owners.of_record("a.weights", ask) is None
     assert owners.of_record("a.weights", lambda _: Takes((), open=True)) == ("a", "weights")
+
+
+@pytest.mark.parametrize(("default", "text"), [(5, "5:25"), (26, None), (None, "5:25"), (26, "5:25")])
+def test_default_of_a_program_lies_within_its_range(default, text):
+    argument = Argument("v", default=default, distribution=text and parse_spec(text))
+    refusal = pytest.raises(PluginError, match=r"the default of its argument v, 26, is outside its range '5:25'")
+    with refusal if (default, text) == (26, "5:25") else nullcontext():
+        _check_defaults("exec:./p", CallSignature({"v": argument}, open=False, given=()))
 
 
 def test_code_states_what_an_agent_takes(folder):

@@ -55,7 +55,7 @@ def work(tmp_path, monkeypatch):
     def run_to_end(command, folder, environment):
         found.ran.append((command, folder, environment))
         if command[2] == "-c":
-            origin = found.answers["origin"] or folder / "mine.py"
+            origin = (command[-1] != "yours" and found.answers["origin"]) or folder / "mine.py"
             return SimpleNamespace(stdout=f"{origin}\n", returncode=found.answers["code"])
         return SimpleNamespace(stdout=found.answers["corpus"], stderr="crashhunt: it  does\nnot run", returncode=2)
 
@@ -155,9 +155,8 @@ def test_agent_from_elsewhere_than_the_commit_is_refused(work, tmp_path):
     work.answers["code"] = 1  # the hunt reports it
     started(of_commits(work), tmp_path / "g2")
     hunts = {"loop": request(work.folder, agents={"a": "mine:A", "b": "yours:B"})}
-    work.answers.update(code=0, origin=None)
-    asked = replace(of_commits(work), hunts=hunts)
-    started(asked, tmp_path / "g3")
+    work.answers["code"] = 0
+    started(replace(of_commits(work), hunts=hunts), tmp_path / "g3")  # one of the two is of the commit
     assert [command[-1] for command, *_ in work.ran[-4:]] == ["mine", "yours"] * 2
 
 
