@@ -108,20 +108,6 @@ def test_the_outlines_say_who_of_a_report_drove_into_which():
     assert facts(hits(ReportedCollision(), before, after)[0]) == ("ego", "collider", "ego", "gone", 7, 3)
 
 
-def test_the_one_that_turns_within_a_step_is_looked_at_with_what_that_sweeps():
-    """Its back swings through a place where it is neither before nor after."""
-    small = Roster((Actor("ego", "passenger", 5.0, 2.0), Actor("post", "post", 0.4, 0.4)))
-
-    def at(heading, place, time_s):
-        points = [(0.0, 0.0), (place * math.cos(math.pi / 4), place * math.sin(math.pi / 4))]
-        return Scene(time_s, small, points, [heading, 0.0], [3.0, 0.0], swept=True)
-
-    for place, touched in ((-3.5, True), (-4.5, False)):
-        before, after = at(0.0, place, 0.0), at(math.pi / 2, place, 1.0)
-        assert bool(hits(Overlap(), before, after)) == touched, place
-        assert hits(Overlap(), at(0.0, place, 0.0)) == hits(Overlap(), at(math.pi / 2, place, 0.0)) == []
-
-
 def test_the_nearest_comes_first():
     (first, second) = hits(Overlap(), scene(("ego", 0, 0, 0, 1), ("a", 4.5, 0, 0, 1), ("b", 3, 1, 0, 1)))
     assert (first.victim, second.victim) == ("b", "a")

@@ -116,22 +116,6 @@ def test_the_closest_approach_of_known_scenes():
     assert closest_approach([scene(("a", 0, 0, 0, 20))], ["ego"]) == alone
 
 
-@given(st.lists(st.tuples(*[st.floats(-60, 60)] * 2, st.floats(-3, 3), st.floats(0, 30)), min_size=2, max_size=8))
-@settings(deadline=None)
-def test_many_scenes_at_once_are_measured_as_one_by_one(vehicles):
-    scenes = []
-    for number in range(4):
-        moved = [
-            (f"v{n}", x + number, y, h, v) for n, (x, y, h, v) in enumerate(vehicles[: len(vehicles) - number % 2])
-        ]
-        scenes.append(scene(*moved))
-    together = approaches([view.frame for view in scenes], "v0")
-    for number, view in enumerate(scenes):
-        alone = approaches([view.frame], "v0")
-        for all_values, one in zip(together, alone, strict=True):
-            assert all_values[number] == one[0]
-
-
 def test_neighbors_are_sorted_and_complete():
     view = scene(("a", 0, 0, 0, 1), ("b", 3, 4, 0, 1), ("c", 1, 0, 0, 1), ("d", -2, 0, 0, 1))
     assert view.neighbors(0) == [(1.0, 2), (4.0, 3), (25.0, 1)]

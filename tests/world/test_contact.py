@@ -109,25 +109,6 @@ def test_who_was_not_there_or_was_put_there_did_not_drive():
 
 @pytest.mark.parametrize("turned", TURNS)
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_lane_change_comes_at_the_end_of_the_step(turned, side):
-    """As in SUMO: first ahead in the old lane, then over at once."""
-    before = [(0, 0, 0, 20), (30, 3.2 * side, 0, 0)]
-    assert touched(turned, before, [(20, 3.2 * side, 0, 20), before[1]]) is None
-    hit = touched(turned, before, [(26, 3.2 * side, 0, 26), before[1]])
-    assert hit.share == 1
-    assert hit.drives_into
-    # Who is run into by that stands beside, and it is the one that jumps that drives into the other.
-    beside = touched(
-        turned, [(0, 0, 0, 20), (1, 3.2 * side, 0, 20)], [(20, 3.2 * side, 0, 20), (21, 3.2 * side, 0, 20)]
-    )
-    assert beside.share == 1
-    standing = [(12, 0, 0, 0), (12, 0, 0, 0)]
-    old = touched(turned, [(0, 0, 0, 20), standing[0]], [(20, 3.2 * side, 0, 20), standing[1]])
-    assert old.share == pytest.approx(7 / 20, abs=1e-6)
-
-
-@pytest.mark.parametrize("turned", TURNS)
-@pytest.mark.parametrize("side", [1, -1])
 def test_a_quarter_of_a_circle_is_driven_along(turned, side):
     """Centre on a circle of 20 m to that side; who stands on the chord is passed, who stands on the arc is not."""
     radius, half, quarter = 20.0, 2.5, math.pi / 2

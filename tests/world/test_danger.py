@@ -87,23 +87,6 @@ def test_oncoming_traffic_in_a_bend_is_no_danger():
     assert meets.max() > 0.4
 
 
-def test_an_agent_that_has_to_brake_hard_is_in_danger_though_it_never_gets_there():
-    def stop(braking):
-        time = 0.1 * np.arange(120)
-        left = np.minimum(np.maximum(time - 3, 0), 15 / braking)
-        x = 15 * np.minimum(time, 3) + 15 * left - braking * left**2 / 2
-        return np.stack((x, 0 * x, 0 * x), axis=1)
-
-    for braking in (3.0, 8.0):
-        standing = 45 + 225 / (2 * braking) + 1 + LENGTH
-        left = straight(standing, 0, 0, 0, 120)
-        left[int(40 + 150 / braking) :, 1] = 20.0  # 1 s after the agent has stopped, it is gone
-        steps, most = level(stop(braking), left, straight(standing + 60, 0, 0, 0, 120))
-        assert steps.max() == pytest.approx(braking / 12, rel=0.2), braking
-        assert most.other == "other"
-        assert most.step > 20
-
-
 def test_the_one_that_reverses_continues_backwards():
     """Where its way ends, it goes straight back: whoever stands there is as near as if it were ahead."""
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from crashhunt.world import outlines_overlap, rectangle_gap, time_to_contact
+from crashhunt.world import outlines_overlap, time_to_contact
 from crashhunt.world._geometry import separation
 
 TURNS = [0.0, 0.6, 2.2, -1.9]
@@ -98,29 +98,6 @@ def test_what_touches_by_rounding_only_does_not_overlap(turned, x, y, heading, a
     assert separation(one, nearer(0.5))[0] == pytest.approx(-0.5)
 
 
-def test_a_gap_is_measured_to_the_nearest_corner():
-    def gap(x, y, turn, one=(2.5, 1.0), two=(2.5, 1.0)):
-        return rectangle_gap(*(np.array([value], dtype=float) for value in ((x, y), turn, one, two)))[0]
-
-    assert gap(8, 5, 0) == pytest.approx(math.hypot(3, 3))
-    assert gap(-8, -6, 0) == pytest.approx(math.hypot(3, 4))
-    assert gap(0, 4, 0) == pytest.approx(2)
-    assert gap(9, 0, math.pi / 2) == pytest.approx(5.5)
-    assert gap(0, 9, math.pi / 2) == pytest.approx(5.5)
-    reach = 3.5 / math.sqrt(2)
-    assert gap(9, 1, math.pi / 4) == pytest.approx(6.5 - reach)
-    assert gap(-9, 1, -math.pi / 4) == pytest.approx(6.5 - reach)
-    assert gap(0, 9, 3 * math.pi / 4) == pytest.approx(8 - reach)
-    assert gap(9, 0, 0, (2.5, 1.0), (4.0, 0.5)) == pytest.approx(2.5)
-    assert gap(5, 5, math.pi / 4, (1, 1), (0.5, 3)) == pytest.approx(8 / math.sqrt(2) - 0.5)  # corner to side
-    assert gap(5, 5, -math.pi / 4, (0.5, 3), (1, 1)) == pytest.approx(math.hypot(4.5, 2) - math.sqrt(2), abs=0.5)
-    for offset in ((0, 0), (4.9, 0), (4.9, 1.9), (0, -1.9)):
-        assert gap(*offset, 0) == 0
-    assert gap(5.0, 0, 0) == 0  # bumper to bumper
-    for turn in (math.pi / 2, math.pi / 4, -1.2):  # a cross: no corner of one is within the other
-        assert gap(0.3, -0.2, turn, (9, 0.3), (8, 0.4)) == 0
-
-
 def test_the_time_of_contact_is_that_of_the_last_axis():
     def time(x, y, vx, vy, turn=0.0, one=(2.5, 1.0), two=(2.5, 1.0)):
         values = (x, y), (vx, vy), turn, one, two
@@ -143,39 +120,3 @@ def test_the_time_of_contact_is_that_of_the_last_axis():
     assert time(20, 1, -5, 0, math.pi / 4) == pytest.approx((17.5 - 3.5 / math.sqrt(2)) / 5)
     assert time(0, 8, 0, -1, math.pi / 4, (2.5, 1.0), (0.5, 0.5)) == pytest.approx(7 - math.sqrt(0.5))
     assert not math.copysign(1, time(3, 0, 5, 0)) < 0
-
-
-def test_many_pairs_at_once_are_each_their_own():
-    random = np.random.default_rng(3)
-    count = 60
-    offset, velocity = random.uniform(-14, 14, (count, 2)), random.uniform(-9, 9, (count, 2))
-    turn, one, two = (
-        random.uniform(-4, 4, count),
-        random.uniform(0.3, 6, (count, 2)),
-        random.uniform(0.3, 6, (count, 2)),
-    )
-    gaps, times = rectangle_gap(offset, turn, one, two), time_to_contact(offset, velocity, turn, one, two)
-    hits = 0
-    for number in range(count):
-        sizes = tuple(2 * one[number]), tuple(2 * two[number])
-        first = (sizes[0][0] / 2, 0.0, 0.0, *sizes[0])
-
-        def after(time, number=number, sizes=sizes):
-            x, y = offset[number] + velocity[number] * time
-            half = sizes[1][0] / 2
-            return x + half * math.cos(turn[number]), y + half * math.sin(turn[number]), turn[number], *sizes[1]
-
-        apart = separation(first, after(0.0))
-        assert (gaps[number] == 0) == outlines_overlap(first, after(0.0)) == (apart[0] < 0)
-        assert apart[0] <= gaps[number] + 1e-9
-        assert math.hypot(*apart[1:]) == pytest.approx(1)
-        middle = (*offset[number], 0.0)
-        assert apart[1] * middle[0] + apart[2] * middle[1] >= 0
-        if math.isinf(times[number]):
-            assert not any(outlines_overlap(first, after(time)) for time in np.linspace(0, 4, 40))
-        else:
-            hits += 1
-            if times[number] > 0:
-                assert not outlines_overlap(first, after(times[number] - 1e-6))
-            assert outlines_overlap(first, after(times[number] + 1e-6)) or times[number] == 0
-    assert 20 < hits < 55
