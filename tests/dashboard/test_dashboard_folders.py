@@ -550,13 +550,6 @@ def test_server_sends_no_header_of_its_own_and_ignores_those_of_proxies():
     assert {name: getattr(config, name) for name in expected} == expected
 
 
-def test_server_runs_on_the_socket_that_listens(monkeypatch):
-    ran = []
-    monkeypatch.setattr(_serving._Server, "run", lambda self, sockets: ran.append((self.config.app, sockets)))
-    _serving.run_server("app", "socket", print)
-    assert ran == [("app", ["socket"])]
-
-
 @pytest.fixture
 def connection(monkeypatch):
     """A connection on a clock of the test: no part of a request has been read."""

@@ -6,7 +6,6 @@ import random
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 from conftest import crashes_on_loop, examples
@@ -159,19 +158,6 @@ def test_a_trial_that_runs_again_is_counted_once(tmp_path, shell, made_once):
     assert after.trials_run == state.trials_run - 1
     assert view.sample is not None
     assert 2 not in [point["number"] for point in view.sample.points]
-
-
-def test_crash_type_came_with_its_first_trial_though_that_bundle_was_deleted():
-    view = HuntView(SimpleNamespace(path=None))
-    view.counts = TrialCounts(CRASH_ON)
-    view.facts = {
-        "kinds": [
-            {"words": "rear end", "first": "000013-collision"},
-            {"words": "head-on", "first": "000004-collision"},
-        ],
-        "dropped": {"rear end": [9, 1], "side swipe": [0]},
-    }
-    assert view.kind_firsts() == [1, 4]
 
 
 def test_near_misses_are_on_the_map_where_they_were_most_critical(shell, made_once):

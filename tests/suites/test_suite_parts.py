@@ -209,41 +209,6 @@ def test_running_hunt_is_not_run_again(hunt, monkeypatch):
     assert checked == [hunt]
 
 
-@pytest.mark.parametrize(
-    ("state", "failed", "invalid", "everything", "expected"),
-    [
-        ("finished", False, 0, False, "nothing"), ("finished", False, 2, False, "again"),
-        ("queued", False, 0, False, "again"), ("interrupted", True, 0, False, "again"),
-        ("error", True, 0, False, "aside"), ("finished", False, 0, True, "aside"),
-    ],
-)  # fmt: skip
-def test_hunts_run_again_by_their_state(hunt, monkeypatch, state, failed, invalid, everything, expected):
-    found = SimpleNamespace(state=state, failed=failed)
-    ran, aside, seen = [], [], []
-    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: found)
-    monkeypatch.setattr(_hunt_reruns, "_replace_invalid", lambda folder, given: invalid)
-    monkeypatch.setattr(
-        _hunt_reruns, "set_aside", lambda folder, planned: aside.append(planned(folder / "x")) or "aside"
-    )
-
-    def run(folders, parallel, *, watch, machine):
-        ran.append((folders, parallel, machine))
-        if watch:
-            watch()
-
-    monkeypatch.setattr(_hunt_reruns, "run_all", run)
-    written = (hunt / REQUEST).stat().st_ino
-    states, replaced = rerun(
-        [hunt], everything=everything, trusted=True, parallel=2, watch=seen.append, machine={"executor": "fresh"}
-    )
-    assert states == [found]
-    assert replaced == ["aside"] * (expected == "aside")
-    assert aside == [ASKED] * (expected == "aside")
-    assert ran == [([hunt] if expected != "nothing" else [], 2, {"executor": "fresh"})]
-    assert seen == [[found]]
-    assert ((hunt / REQUEST).stat().st_ino != written) is (expected == "again")
-
-
 def test_request_of_a_hunt_without_one_is_that_of_its_settings(hunt, monkeypatch, tmp_path):
     assert _hunt_reruns._request(hunt) == ASKED
     (hunt / REQUEST).unlink()
@@ -277,31 +242,6 @@ def test_changes_of_a_request_name_their_owner(hunt):
     assert _hunt_reruns._changed(other, {"ego.speed": "7"}, hunt).request.arguments == {"ego.speed": "7"}
     with pytest.raises(UsageError, match="--set trials=many"):
         _hunt_reruns._changed(asked, {"trials": "many"}, hunt)
-
-
-@pytest.mark.parametrize(
-    ("state", "runs"), [("queued", True), ("killed", True), ("interrupted", True), ("finished", False)]
-)
-def test_copy_of_a_hunt_resumes_until_it_has_ended(hunt, monkeypatch, tmp_path, state, runs):
-    ran, seen = [], []
-
-    def run(folders, parallel, *, watch, machine):
-        ran.append((folders, parallel, machine))
-        if watch:
-            watch()
-
-    monkeypatch.setattr(_hunt_reruns, "hunt_state", lambda folder: SimpleNamespace(state=state, dir=folder))
-    monkeypatch.setattr(_hunt_reruns, "run_all", run)
-    for _ in range(2):
-        (found,) = _hunt_reruns._run_copies([hunt], tmp_path / "to", {}, 3, seen.append, {"executor": "fresh"})
-        assert found.dir == tmp_path / "to"
-    assert ran == [([tmp_path / "to"], 3, {"executor": "fresh"})] * (2 * runs)
-    assert len(seen) == 2 * runs
-    assert RunRequest.read(tmp_path / "to" / REQUEST) == ASKED
-    with pytest.raises(HuntDirectoryError):
-        _hunt_reruns._run_copies([hunt], tmp_path / "no/to", {}, 3, None, None)
-    (tmp_path / "empty").mkdir()
-    _hunt_reruns._run_copies([hunt], tmp_path / "empty", {}, 3, None, None)
 
 
 @pytest.mark.parametrize(("state", "says"), [("running", "is running"), ("error", "ended in an error")])
@@ -351,7 +291,9 @@ def suite(tmp_path, text):
      ("[defaults]\ntimeout_s = -1.0\n[[hunts]]\nid = 'a'", "hunts.a: timeout_s is -1; give seconds above 0"),
      ("[[hunts]]\nid = 'a'\nkeep = 2", "hunts.a: keep 2 requires .*; give keep_going = true or distinct as well"),
      ("[[hunts]]\nid = 'a'\nsnapshot_limit_mb = 0", "snapshot_limit_mb is 0; .* above 0, or snapshot_code = false"),
-     ("[[hunts]]\nid = 'a'\ntrials = 0", "trials is 0; give .* duration or until_rate")],
+     ("[[hunts]]\nid = 'a'\ntrials = 0", "trials is 0; give .* duration or until_rate"),
+     ("[[hunts]]\nid = 'a'\nseed = -1", "hunts.a.seed = -1"),
+     ("[[hunts]]\nid = 'a'\nscenario = \"a\\u0000b\"", "null byte")],
 )  # fmt: skip
 def test_mistake_in_a_suite_names_its_file(tmp_path, text, says):
     with pytest.raises(UsageError, match=says) as caught:
