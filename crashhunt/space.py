@@ -15,6 +15,6 @@ from crashhunt.trial._argument_space import (
 )
 from crashhunt.trial._call_signature import (
     FILLED_BY_NAME as FILLED_BY_NAME,
-    Signature as Signature,
+    CallSignature as CallSignature,
     signature_of as signature_of,
 )

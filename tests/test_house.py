@@ -271,6 +271,13 @@ def test_a_file_name_stands_once():
     assert {name for name, count in names.items() if count > 1} <= ROLES
 
 
+def test_a_public_class_name_stands_once():
+    """But for the same role in two adapters of simulators, and for the types of what the compiled core returns."""
+    files = [file for file in ROOT.rglob("*.py") if file.relative_to(ROOT).parts[0] not in ("highway", "native")]
+    classes = Counter(node.name for file in files for node in nodes_of(file) if isinstance(node, ast.ClassDef))
+    assert [name for name, count in classes.items() if count > 1 and name[0] != "_"] == []
+
+
 def test_private_modules_that_comments_and_pages_name_are_there():
     files = [
         ROOT.parent / "pyproject.toml",

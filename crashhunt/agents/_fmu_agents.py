@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 import numpy as np
 
-from crashhunt.agents._library_agents import Action, Parts
+from crashhunt.agents._library_agents import ActionArray, ObservationArrays
 from crashhunt.agents._programs import hello_of
 from crashhunt.agents._protocol import ForeignFactory
 from crashhunt.base.agent_locators import fmu_files
@@ -28,7 +28,7 @@ from crashhunt.base.binaries import length_by_headers
 from crashhunt.base.errors import ArgumentError, PluginError, ProgramError
 from crashhunt.base.text import listed, one_line
 from crashhunt.simulators import PARTS
-from crashhunt.trial import Argument, Signature, parse_spec
+from crashhunt.trial import Argument, CallSignature, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -93,7 +93,7 @@ class FmuFactory(ForeignFactory):
 
     def declared_signature(
         self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
-    ) -> Signature:
+    ) -> CallSignature:
         """Return the parameters of the FMU as arguments, which are the same for every vehicle.
 
         Options may choose other observations and actions than the scenario, so the simulator is not used.
@@ -162,7 +162,7 @@ class FmuFactory(ForeignFactory):
     def _wired(self, model: _Model, name: str, simulator: Simulator) -> _Wiring:
         form = simulator.actions[name]
         try:
-            parts, action = Parts.of(simulator, name), Action(form.space, form.names)
+            parts, action = ObservationArrays.of(simulator, name), ActionArray(form.space, form.names)
             return _Wiring(model, parts, action, form.names, hello_of(name, simulator, {}))
         except _UnusableError as error:
             raise self._refusal(str(error), error.fix) from None
@@ -258,7 +258,7 @@ class _Model:
         is_other = base.factor == 0 or any((base.kg, base.A, base.K, base.mol, base.cd))
         return None if is_other else (base.factor, base.offset)
 
-    def signature(self) -> Signature:
+    def signature(self) -> CallSignature:
         """Return the parameters as arguments, with the ranges between their minima and maxima."""
         found = {}
         for one in self.of("parameter"):
@@ -275,7 +275,7 @@ class _Model:
         sources = [self.inputs.get(one.name, one.name) for one in self.of("input")]
         places = [_PLACE.fullmatch(source) for source in sources if isinstance(source, str)]
         parts = dict.fromkeys(place[1] for place in places if place is not None and place[1] in PARTS)
-        return Signature(arguments=found, open=False, given=(), observation=tuple(parts))
+        return CallSignature(arguments=found, open=False, given=(), observation=tuple(parts))
 
 
 _EXPORT = "export it as an FMU for co-simulation by FMI 2 or 3, with a binary for this machine"
@@ -322,7 +322,9 @@ class _Wiring:
         _UnusableError: an input or a value of the action has no source, or the source or the unit does not fit.
     """
 
-    def __init__(self, model: _Model, parts: Parts, action: Action, names: Sequence[str], hello: Hello) -> None:
+    def __init__(
+        self, model: _Model, parts: ObservationArrays, action: ActionArray, names: Sequence[str], hello: Hello
+    ) -> None:
         self.parts, self.action = parts, action
         self.constants: list[tuple[_Variable, float]] = []
         self.fixed_actions: list[tuple[int, float]] = []

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Signature, Value
+    from crashhunt.trial import CallSignature, Value
 
     Getter = Callable[[Any], object]  # returns a part of an observation
 
@@ -91,7 +91,7 @@ class LibraryFactory(ForeignFactory):
 
     def declared_signature(
         self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
-    ) -> Signature:
+    ) -> CallSignature:
         """Return the arguments that the library declares for every vehicle; another process loads it for this."""
         return self._signature(describe_library(self._locator, library_file(self._locator)).declaration)
 
@@ -140,13 +140,13 @@ class LibraryFactory(ForeignFactory):
         assert self._library is not None
         form = simulator.actions[name]
         return LibraryAgent(
-            self._library, name=name, parts=Parts.of(simulator, name),
-            action=Action(form.space, form.names), step_length_s=simulator.step_length_s,
+            self._library, name=name, parts=ObservationArrays.of(simulator, name),
+            action=ActionArray(form.space, form.names), step_length_s=simulator.step_length_s,
             arguments={**self._defaults, **arguments}, limit_s=limit_s,
             road_map=write_road_map(folder, simulator, name) if self.reads_map else None,
         )  # fmt: skip
 
-    def _signature(self, declaration: str) -> Signature:
+    def _signature(self, declaration: str) -> CallSignature:
         try:
             ready = json.loads(declaration)
             # The macro for an argument ends with a comma, and an argument without a range has an empty text.
@@ -202,7 +202,7 @@ class LibraryAgent:
     """
 
     def __init__(
-        self, library: ctypes.CDLL, *, name: str, parts: Parts, action: Action, step_length_s: float,
+        self, library: ctypes.CDLL, *, name: str, parts: ObservationArrays, action: ActionArray, step_length_s: float,
         arguments: Mapping[str, Value], limit_s: float | None = None, road_map: str | None = None,
     ) -> None:  # fmt: skip
         self._limit_s = limit_s
@@ -315,7 +315,7 @@ class _Leaf:
         return _described(self.name, self.shape, self.columns, None if is_bytes else data, data if is_bytes else None)
 
 
-class Parts:
+class ObservationArrays:
     """The arrays of an observation.
 
     Args:
@@ -334,7 +334,7 @@ class Parts:
         self._single = self.leaves[0].values if is_single else None
 
     @classmethod
-    def of(cls, simulator: Simulator, agent: str) -> Parts:
+    def of(cls, simulator: Simulator, agent: str) -> ObservationArrays:
         """Return the arrays of the observations of a vehicle.
 
         Raises:
@@ -379,7 +379,7 @@ def _chained(key: object, get: Getter) -> Getter:
     return lambda observation: get(observation[key])
 
 
-class Action:
+class ActionArray:
     """The array of an action at a fixed address, followed by values that the library must not change.
 
     Args:

@@ -30,7 +30,7 @@ from crashhunt.base.foreign_code import supports
 from crashhunt.base.text import one_line
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import NamesMetaActions, ObservesParts, ProvidesRoadMaps
-from crashhunt.trial import Argument, Constant, Signature, kind_of, parse_spec
+from crashhunt.trial import Argument, CallSignature, Constant, kind_of, parse_spec
 from crashhunt.world import describe_road_map
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class ProgramFactory(ForeignFactory):
 
     def declared_signature(
         self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
-    ) -> Signature:
+    ) -> CallSignature:
         """Run the program once, and return the arguments that it declares in its first answer.
 
         The program receives ``hello`` without arguments, and then ``close``. Without a simulator, ``hello`` has no
@@ -280,7 +280,7 @@ def _check_ready(ready: Mapping[str, Any]) -> None:
         raise ProgramError(f"its format is {excerpt_of(form)} (allowed: {allowed})", fix='send "format": "json"')
 
 
-def _signature_in(ready: Mapping[str, Any]) -> Signature:
+def _signature_in(ready: Mapping[str, Any]) -> CallSignature:
     """Return what a program declares; a program that declares no arguments accepts any.
 
     Raises:
@@ -302,7 +302,7 @@ def _signature_in(ready: Mapping[str, Any]) -> Signature:
         raise ProgramError(f"its observation is {excerpt_of(observation)}, not a list of names", fix=_PARTS_FIX)
     if not isinstance(action, str):
         raise ProgramError(f"its action is {excerpt_of(action)}, not a name", fix="see crashhunt list actions")
-    return Signature(
+    return CallSignature(
         arguments=arguments, open=not arguments, given=(), required=required, action=action,
         observation=tuple(observation), revision=one_line(revision)[:_MAX_REVISION_CHARACTERS],
     )  # fmt: skip

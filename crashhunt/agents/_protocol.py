@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gymnasium import Space
 
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Signature, Value
+    from crashhunt.trial import CallSignature, Value
 
 
 @runtime_checkable
@@ -49,7 +49,7 @@ class ForeignFactory(Protocol):
 
     def declared_signature(
         self, agent: str = "", simulator: Simulator | None = None, *, limit_s: float = 0.0
-    ) -> Signature:
+    ) -> CallSignature:
         """Return the arguments that the program, library or FMU declares.
 
         Args:

@@ -33,7 +33,7 @@ _SEEN_LONGER_S = 1.0  # by which the crash may come later than it did: the other
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RemainingActors:
     """The actors of a crash that remain in a candidate."""
 
     agents: tuple[str, ...]  # identifiers of the agents that drive themselves
@@ -57,14 +57,14 @@ class Scripting:
         escape = rerun.bundle.result.escape
         # An agent that cannot avoid it any more is not tested: however it is mended, it crashes.
         self._latest = recorded.steps if escape is None or escape.step is None else escape.step
-        self.whole = Part(recorded.agents, self._paths.names)
+        self.whole = RemainingActors(recorded.agents, self._paths.names)
 
     @property
     def steps(self) -> int:
         """The number of recorded steps."""
         return self._paths.steps
 
-    def spec(self, part: Part) -> TrialSpec:
+    def spec(self, part: RemainingActors) -> TrialSpec:
         """Return the trial for the remaining actors, with the recorded arguments."""
         paths = self._paths.driven_by(part.agents).only(part.others)
         paths = paths.cut(part.begin, paths.steps, self._step_s).placing()
@@ -289,7 +289,7 @@ class Minimizer:
         """
         others = tuple(name for name in scripting.whole.others if name in (self.best.only or ()))
         agents = scripting.whole.agents
-        whole = Part(agents, others)
+        whole = RemainingActors(agents, others)
         parts = [*(replace(whole, begin=begin) for begin in scripting.begins(agents)), whole]
         before, self._runs.most_steps = self._runs.most_steps, self._shortest
         try:
@@ -321,13 +321,13 @@ class Minimizer:
 
         fewest(script.names, tried)
 
-    def _fewest_moved(self, scripting: Scripting) -> Part | None:
+    def _fewest_moved(self, scripting: Scripting) -> RemainingActors | None:
         """Remove all unnecessary actors in scripted form; return None if the crash does not reproduce in this form."""
         whole, about = scripting.whole, self._rerun.bundle.driver
         near = [name for name in _nearest(self._rerun.recorded, about) if name not in whole.agents]
         other = tuple(self._others_of_the_crash())
         alone = (about,) if len(whole.agents) > 1 and about in whole.agents else ()
-        likely: list[Part] = []
+        likely: list[RemainingActors] = []
         for agents in dict.fromkeys((alone, whole.agents) if alone else (whole.agents,)):
             moved = [name for name in whole.agents if name not in agents]
             groups = [
@@ -340,7 +340,7 @@ class Minimizer:
                 (*moved, *near),
             ]
             groups = [tuple(name for name in group if name not in agents) for group in groups]
-            likely += [Part(agents, group) for group in dict.fromkeys(groups)]
+            likely += [RemainingActors(agents, group) for group in dict.fromkeys(groups)]
         likely.append(whole)
         good = self._try([scripting.spec(part) for part in likely])
         if good is None:
@@ -352,7 +352,7 @@ class Minimizer:
 
         return replace(found, others=fewest(found.others, tried))
 
-    def _fewer_from_later_on(self, scripting: Scripting, part: Part) -> None:
+    def _fewer_from_later_on(self, scripting: Scripting, part: RemainingActors) -> None:
         """Remove more actors with a later beginning; actors that mattered only before it are then unnecessary.
 
         The method first tries each other actor alone, and in a pair with the collision partner. Then the method starts
@@ -380,7 +380,7 @@ class Minimizer:
             if best.count <= _FEW_ACTORS:
                 break
 
-    def _without_any(self, scripting: Scripting, part: Part) -> Part | None:
+    def _without_any(self, scripting: Scripting, part: RemainingActors) -> RemainingActors | None:
         """Remove the unnecessary actors of a part; return None if the crash does not reproduce with the whole part."""
         if self._runs.first([scripting.spec(part)]) is None:
             return None

@@ -172,7 +172,7 @@ def _check_agent(name: str) -> None:
     """
     from crashhunt.base.isolation import work_apart
     from crashhunt.base.plugins import is_foreign, locate
-    from crashhunt.trial import Signature, signature_of
+    from crashhunt.trial import CallSignature, signature_of
 
     def described(_report: object = None) -> Plain:
         return signature_of(locate("agents", name)).to_json()
@@ -180,7 +180,7 @@ def _check_agent(name: str) -> None:
     # A module of the user may end or stop the process that imports it.
     task = f"{name!r} cannot be imported"
     data = work_apart(described, task=task, timeout_s=_IMPORT_S) if is_foreign("agents", name) else described()
-    required = Signature.from_json(data).required
+    required = CallSignature.from_json(data).required
     if required:
         fix = "give the argument a default in the agent's code, because the new scenario sets no value"
         raise UsageError(f"--agent {name}: the agent needs the argument {required[0]!r}", fix=fix)

@@ -16,7 +16,7 @@ from crashhunt.base.errors import CrashhuntError, PluginError, UsageError
 from crashhunt.base.exceptions import blamed
 from crashhunt.base.plugins import locate, registered
 from crashhunt.base.text import one_of
-from crashhunt.disturbances._protocol import Closes, DisturbanceModel, Drawn
+from crashhunt.disturbances._protocol import DisturbanceModel, Drawn, HoldsResources
 from crashhunt.trial import CELLS, KINDS, SENSOR_KINDS, Disturbance, in_turn, is_signal, why_not
 
 if TYPE_CHECKING:
@@ -405,7 +405,7 @@ class DisturbanceSampler:
     def close(self) -> None:
         """End the processes in which foreign models draw."""
         for model in self.models.values():
-            if isinstance(model, Closes):
+            if isinstance(model, HoldsResources):
                 model.close()
 
     def chance(self, name: str) -> float:

@@ -56,7 +56,7 @@ class Enumerates(Protocol):
 
 
 @runtime_checkable
-class Closes(Protocol):
+class HoldsResources(Protocol):
     """A model that holds resources, which it releases when it is closed."""
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ._action_override import (
         Braking as Braking,
         HandedOver as HandedOver,
-        ReferenceDriver as ReferenceDriver,
+        ReferenceCorrection as ReferenceCorrection,
         overruled_agent as overruled_agent,
     )
     from ._blame import has_users_code as has_users_code, internal_error as internal_error

@@ -50,7 +50,7 @@ def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -
     if overruled.reference in REFERENCE_MODELS:
         return CompetentDriver(driver, simulator, overruled)
     if overruled.reference:
-        return ReferenceDriver(driver, simulator, overruled)
+        return ReferenceCorrection(driver, simulator, overruled)
     if overruled.keeps:
         return Keeping(driver, simulator, overruled.agent, overruled.after, overruled.keeps)
     return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)
@@ -237,7 +237,7 @@ class _Response:
         }  # fmt: skip
 
 
-class ReferenceDriver(_Overruling):
+class ReferenceCorrection(_Overruling):
     """Lets an agent drive, and after a step corrects its unsafe speeds, lane changes, or both.
 
     Raises:

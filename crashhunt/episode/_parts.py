@@ -23,7 +23,7 @@ from crashhunt.episode._failures import record_originals
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
 from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ProvidesRoadMaps, ReportsNotices
-from crashhunt.trial import Signature, fold_signals, signature_of
+from crashhunt.trial import CallSignature, fold_signals, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -68,7 +68,7 @@ class Parts:
 
     def __init__(self, settings: WorkerSettings) -> None:
         self._settings = settings
-        self._factories: dict[str, tuple[Any, Signature]] = {}
+        self._factories: dict[str, tuple[Any, CallSignature]] = {}
         sys.path[:0] = settings.code
         # What the snapshot does not have may come from where the hunt was started, as it did then.
         add_current_folder(always_last=bool(settings.code))
@@ -194,14 +194,14 @@ class Parts:
         }
         return factory, {**given, **fold_signals(values)}
 
-    def _factory(self, agent: str) -> tuple[Any, Signature]:
+    def _factory(self, agent: str) -> tuple[Any, CallSignature]:
         found = self._factories.get(agent)
         if found is None:
             factory = locate("agents", self._settings.scenario.agents[agent].agent)
             if isinstance(factory, LibraryFactory | FmuFactory):
                 factory.load(self._settings.argument_files, self._settings.scratch)
             if isinstance(factory, _FOREIGN):  # it would have to run to report its arguments
-                return self._factories.setdefault(agent, (factory, Signature({}, open=True, given=())))
+                return self._factories.setdefault(agent, (factory, CallSignature({}, open=True, given=())))
             if not factory.__module__.startswith("crashhunt."):  # which a pool's worker has loaded before
                 require_origin(factory.__module__, self._settings.code)
             found = self._factories[agent] = factory, signature_of(factory)

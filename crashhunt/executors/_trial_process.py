@@ -37,7 +37,7 @@ from crashhunt.episode import (
     OnsetForcer,
     Parts,
     Prober,
-    ReferenceDriver,
+    ReferenceCorrection,
     are_functions_replaced,
     has_users_code,
     internal_error,
@@ -99,7 +99,7 @@ class TrialProcess:
         self._modules = frozenset(sys.modules)
         self._made_at = time.time()
         self._opened: OpenedFiles | None = None
-        self._reference: ReferenceDriver | CompetentDriver | None = None
+        self._reference: ReferenceCorrection | CompetentDriver | None = None
         self._lights: LightRecorder | None = None
         self._fork_runners: tuple[ForkRunner, ...] = ()  # of copies of the trial
         # Line by line, so that what a dying process printed last is in the file.
@@ -333,7 +333,7 @@ class TrialProcess:
             made = HandedOver(made, spec.handover)
         if spec.overruled is not None and spec.overruled.agent == agent:
             made = overruled_agent(made, simulator, spec.overruled)
-            self._reference = made if isinstance(made, ReferenceDriver | CompetentDriver) else None
+            self._reference = made if isinstance(made, ReferenceCorrection | CompetentDriver) else None
         return made
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.hunts._reports import BranchReport, ProbeReport, RareReport
-from crashhunt.hunts._verification import Found, VerificationRuns
+from crashhunt.hunts._verification import ForkCrash, VerificationRuns
 from crashhunt.results import BRANCHES, PROBES, sums_of_branches, sums_of_probes
 from crashhunt.statistics import crashed_copies, rare_watch
 from crashhunt.trial import Branches, Stress, in_turn
@@ -64,16 +64,16 @@ def verify_branches(copies: VerificationRuns) -> BranchReport | None:
     )
 
 
-def likeliest(result: TrialResult) -> Found | None:
+def likeliest(result: TrialResult) -> ForkCrash | None:
     """Return a whole trial with the disturbances of the likeliest crashed branch; None if no branch crashed."""
     if result.branches is None or not result.branches.crashes:
         return None
     return _specification(result, max(result.branches.crashes, key=_log_likelihood))
 
 
-def _specification(result: TrialResult, branch: Branch) -> Found:
+def _specification(result: TrialResult, branch: Branch) -> ForkCrash:
     spec = replace(result.spec, disturbances=branch.disturbances, origin="branch")
-    return Found(spec, branch.outcome, branch.step)
+    return ForkCrash(spec, branch.outcome, branch.step)
 
 
 def _log_likelihood(branch: Branch) -> float:
@@ -137,13 +137,13 @@ def _as_it_took_place(stress: Stress | None, result: TrialResult) -> Disturbance
     return next((one for one in result.disturbances if (one.step, one.agent, one.what) == key), planned)
 
 
-def mildest(result: TrialResult) -> Found | None:
+def mildest(result: TrialResult) -> ForkCrash | None:
     """Return a trial from the start with the mildest disturbance that made a probe crash; None if no probe crashed."""
     stress = result.stress
     if stress is None or stress.disturbance is None:
         return None
     planned = in_turn([*result.spec.disturbances, stress.disturbance])
-    return Found(replace(result.spec, disturbances=planned, origin="probe"), stress.outcome, stress.step)
+    return ForkCrash(replace(result.spec, disturbances=planned, origin="probe"), stress.outcome, stress.step)
 
 
 # A crash that a copy of a trial has found, and that comes again from the start, ends a hunt as any other does.
@@ -211,12 +211,12 @@ class ForkCrashes:
         upcoming = self._trials.upcoming
         return self._deterministic and upcoming is not None and upcoming < number
 
-    def _crashes_of_copies(self, result: TrialResult) -> list[tuple[str, Found]]:
+    def _crashes_of_copies(self, result: TrialResult) -> list[tuple[str, ForkCrash]]:
         """Return the crash of a fork with the disturbance kinds of the hunt: the likeliest branch, or a probe."""
         every = ((layout.BRANCHES, likeliest(result)), (layout.PROBES, mildest(result)))
         return [(folder, one) for folder, one in every if one is not None and self._is_of_the_hunt(one)]
 
-    def _is_of_the_hunt(self, found: Found) -> bool:
+    def _is_of_the_hunt(self, found: ForkCrash) -> bool:
         disturber = self._copies.disturber
         kinds = {model.what for model in disturber.models.values()} if disturber is not None else set()
         return all(one.what in kinds or (disturber and one in disturber.fixed) for one in found.spec.disturbances)
@@ -270,6 +270,6 @@ def verify_rare(copies: VerificationRuns, *, differences: int = 0) -> RareReport
     return RareReport(estimate=estimate, run_again=verified, not_finished=not_finished, crashes=crashes)
 
 
-def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> Found:
+def _crash_of_copy(result: TrialResult, copy: ForcedCopy) -> ForkCrash:
     spec = replace(result.spec, disturbances=copy.disturbances, forcing=None, origin="rare")
-    return Found(spec, copy.crash, copy.step)
+    return ForkCrash(spec, copy.crash, copy.step)

@@ -148,7 +148,7 @@ class TrialReruns:
         """Whether a stop is requested."""
         return bool(self.setup.stops)
 
-    def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[Again]:
+    def run(self, specs: Iterable[TrialSpec], folder: str) -> Iterator[RepeatedTrial]:
         """Yield each trial as it ends, until a stop is requested.
 
         Fields of the specifications other than the number may have been changed. Bundles are written into ``folder``, a
@@ -176,7 +176,7 @@ class TrialReruns:
                 runs = Reruns(again, "snapshot", parallel=self.setup.parallel_here, stopped=self._show_progress)
                 with closing(runs), suppress(StoppedError):
                     for ended in runs.run(group, recorded=False):
-                        yield Again(ended=ended, runs=self, snapshot=digest, folder=folder)
+                        yield RepeatedTrial(ended=ended, runs=self, snapshot=digest, folder=folder)
             finally:
                 remove_scratch(scratch)
 
@@ -271,7 +271,7 @@ def is_settled(bundle: Bundle) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Again:
+class RepeatedTrial:
     """A trial that has been run again.
 
     Args:
@@ -304,7 +304,7 @@ class Again:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ForkCrash:
     """A crash of a fork of a trial."""
 
     spec: TrialSpec
@@ -331,7 +331,7 @@ class VerificationRuns:
         """Whether a stop is requested; some crashes of forks may then not have been run from the start."""
         return self.again.is_stopped
 
-    def crashes(self, found: Sequence[Found], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
+    def crashes(self, found: Sequence[ForkCrash], folder: str, name: PhaseName) -> tuple[tuple[Bundle, ...], int]:
         """Return the crashes that reproduce at the same step, and are then confirmed bit-identically, in their order.
 
         The second value is the number of runs that did not finish.
@@ -355,7 +355,7 @@ class VerificationRuns:
         crashed = kept | crashed
         return tuple(crashed[one.spec.number] for one in found if one.spec.number in crashed), len(unanswered)
 
-    def crash(self, found: Found, folder: str) -> Bundle | None:
+    def crash(self, found: ForkCrash, folder: str) -> Bundle | None:
         """Run the crash of a fork from the start; return its bundle if two runs reproduce the crash.
 
         The first run must crash at the same step as the fork, and the second run must be bit-identical to the first.
@@ -367,7 +367,7 @@ class VerificationRuns:
         self.kept.setdefault(folder, {}).update(crashed)
         return crashed.get(found.spec.number)
 
-    def _run(self, found: Sequence[Found], folder: str) -> tuple[dict[int, Bundle], set[int]]:
+    def _run(self, found: Sequence[ForkCrash], folder: str) -> tuple[dict[int, Bundle], set[int]]:
         """Return the bundles of runs that crashed like their forks, and the numbers of trials without an answer."""
         wanted = {one.spec.number: one for one in found}
         unanswered = set(wanted)

@@ -23,8 +23,8 @@ from crashhunt.plans._settings import AgentSettings, ArgumentSpec
 from crashhunt.trial import (
     FILLED_BY_NAME,
     Argument,
+    CallSignature,
     Constant,
-    Signature,
     expand_signal,
     is_signal,
     parse_spec,
@@ -203,7 +203,7 @@ def _takes_of_program(locator: str) -> Takes:
 def settings_of_agents(
     request: Request,
     scenario: Scenario,
-    signatures: Mapping[str, Signature],
+    signatures: Mapping[str, CallSignature],
     actions: Mapping[str, str],
     observations: Mapping[str, tuple[str, ...]],
     *,
@@ -251,7 +251,7 @@ def settings_of_agents(
     return agents
 
 
-def _owner(name: str, scenario: Scenario, signatures: Mapping[str, Signature]) -> tuple[str, str]:
+def _owner(name: str, scenario: Scenario, signatures: Mapping[str, CallSignature]) -> tuple[str, str]:
     """Return the agent and the name to which an ``--arg`` refers."""
     takes = {agent: Takes(signature.arguments, signature.open) for agent, signature in signatures.items()}
     owner = Owners(takes).of(name, option="--arg")

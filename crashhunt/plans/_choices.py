@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from crashhunt.plans._settings import HuntSettings
     from crashhunt.samplers import NamedSampler
     from crashhunt.scenario import Scenario
-    from crashhunt.trial import Category, Signature
+    from crashhunt.trial import CallSignature, Category
 
 
 def chosen_actions(
-    asked: str, scenario: Scenario, signatures: Mapping[str, Signature], brought: Collection[str] = ()
+    asked: str, scenario: Scenario, signatures: Mapping[str, CallSignature], brought: Collection[str] = ()
 ) -> dict[str, str]:
     """Return the form of actions of each agent for which the command line or the agent's class chooses one.
 
@@ -93,7 +93,7 @@ def refuse_misplaced_plans(scenario: Scenario, kinds: Iterable[str]) -> None:
             raise UsageError(message, fix=f"give --action trajectory:tracker=pure_pursuit, or omit {kind}")
 
 
-def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, Signature]) -> Iterator[str]:
+def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, CallSignature]) -> Iterator[str]:
     """Yield notes on the agents whose class names another form than the hunt uses, or names none as a hunt reads it."""
     for agent, setup in scenario.agents.items():
         examples = {"action": '"acceleration"', "observation": '["ego", "actors"]'}
@@ -111,7 +111,7 @@ def notes_on_declarations(scenario: Scenario, signatures: Mapping[str, Signature
 
 
 def chosen_observations(
-    asked: Sequence[str], scenario: Scenario, signatures: Mapping[str, Signature], brought: Collection[str] = ()
+    asked: Sequence[str], scenario: Scenario, signatures: Mapping[str, CallSignature], brought: Collection[str] = ()
 ) -> dict[str, tuple[str, ...]]:
     """Return the parts of each agent for which the command line, the scenario or the agent's class names parts.
 

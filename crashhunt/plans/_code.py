@@ -21,7 +21,7 @@ from crashhunt.base.text import listed
 from crashhunt.disturbances import described_model, modules_of_models, parse_rates
 from crashhunt.oracles import described_oracle, modules_of, oracle_name
 from crashhunt.plans._executor_choice import executor_name
-from crashhunt.trial import Signature, signature_of
+from crashhunt.trial import CallSignature, signature_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,7 +50,7 @@ class CodeFacts:
         notes: what the user should know, as lines of text.
     """
 
-    signatures: Mapping[str, Signature]
+    signatures: Mapping[str, CallSignature]
     oracles: Mapping[str, Mapping[str, Category]] = field(default_factory=dict)
     disturbances: Mapping[str, str] = field(default_factory=dict)
     imported: ImportedModules | None = None
@@ -97,7 +97,7 @@ def describe_code(
         return CodeFacts({locator: signature_of(locate("agents", locator)) for locator in locators})
     declared, notes = _declared(programs, scenario, timeout_s) if programs else ({}, [])
     data: Any = work_apart(described, task="what it names cannot be imported", timeout_s=IMPORT_S + timeout_s)
-    signatures = {locator: Signature.from_json(found) for locator, found in data["signatures"].items()} | declared
+    signatures = {locator: CallSignature.from_json(found) for locator, found in data["signatures"].items()} | declared
     revisions = {locator: one.revision for locator, one in declared.items() if one.revision}
     return CodeFacts(
         signatures=signatures, oracles=data["oracles"], disturbances=data["disturbances"],
@@ -105,7 +105,9 @@ def describe_code(
     )  # fmt: skip
 
 
-def _declared(locators: Sequence[str], scenario: Scenario, limit_s: float) -> tuple[dict[str, Signature], list[str]]:
+def _declared(
+    locators: Sequence[str], scenario: Scenario, limit_s: float
+) -> tuple[dict[str, CallSignature], list[str]]:
     """Return the arguments that programs declare, and a note for each program that has failed.
 
     A program that fails takes any argument. The trials report the failure, each as an error of the agent. The
@@ -126,16 +128,16 @@ def _declared(locators: Sequence[str], scenario: Scenario, limit_s: float) -> tu
                     signature = locate("agents", locator).declared_signature(agent, simulator, limit_s=limit_s)
                 except ProgramError as error:
                     found["notes"].append(f"{locator} has not declared its arguments: {error}")
-                    signature = Signature({}, open=True, given=())
+                    signature = CallSignature({}, open=True, given=())
                 _check_defaults(locator, signature)
                 found["signatures"][locator] = signature.to_json()
         return found
 
     data: Any = work_apart(described, task="the programs cannot be described", timeout_s=IMPORT_S + limit_s)
-    return {locator: Signature.from_json(found) for locator, found in data["signatures"].items()}, data["notes"]
+    return {locator: CallSignature.from_json(found) for locator, found in data["signatures"].items()}, data["notes"]
 
 
-def _check_defaults(locator: str, signature: Signature) -> None:
+def _check_defaults(locator: str, signature: CallSignature) -> None:
     """Refuse defaults outside of their range.
 
     Raises:

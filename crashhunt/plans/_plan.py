@@ -45,7 +45,7 @@ from crashhunt.scenario import (
     with_action,
     with_observations,
 )
-from crashhunt.trial import CRASHES, Constant, Signature
+from crashhunt.trial import CRASHES, CallSignature, Constant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -150,7 +150,7 @@ def _with_notes(scenario: Scenario, run: RunSettings) -> Scenario:
     return replace(scenario, notes=(*scenario.notes, *filter(None, notes)))
 
 
-def _notes_on_statistics(settings: HuntSettings, signatures: Mapping[str, Signature]) -> Iterator[str]:
+def _notes_on_statistics(settings: HuntSettings, signatures: Mapping[str, CallSignature]) -> Iterator[str]:
     """Yield a note for each unused file next to a policy that may contain its statistics of `VecNormalize`."""
     for agent, chosen in settings.agents.items():
         path = chosen.arguments["path"].distribution if "path" in chosen.arguments else None

@@ -48,7 +48,7 @@ _SPEEDS_KMH = (1, 250)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Group:
+class CaseGroup:
     """A group of cases of a regulation."""
 
     id: str  # name of the group
@@ -67,52 +67,52 @@ class Group:
 
 
 _R157 = (
-    Group(
+    CaseGroup(
         id="cut-in", paragraph="4.4", x="gap_m", y="lateral_mps",
         axes={"gap_m": "0:60:5", "lateral_mps": "0.5:3:0.5"}, constants={"side": "1"},
         models=COMPETENT_DRIVERS, why_not="",
     ),
-    Group(
+    CaseGroup(
         id="cut-out", paragraph="4.5", x="front_m", y="lateral_mps",
         axes={"front_m": "10:100:10", "lateral_mps": "0.5:3:0.5"}, constants={"headway_s": "2", "side": "1"},
     ),
-    Group(
+    CaseGroup(
         id="deceleration", paragraph="4.3", x="headway_s", y="decel_mps2",
         axes={"headway_s": "1:3:0.25", "decel_mps2": "1:10:1"}, constants={},
     ),
-    Group(
+    CaseGroup(
         id="lane-keeping", paragraph="4.1", x="swerve_m", y="beside_m",
         axes={"swerve_m": "0:0.8:0.2", "beside_m": "-5:5:2.5"},
         constants={"headway_s": "2", "period_s": "8", "side": "1"},
     ),
-    Group(
+    CaseGroup(
         id="following", paragraph="4.3", x="offset_m", y="slower_kmh",
         axes={"offset_m": "-1.75:1.75:0.5", "slower_kmh": "0:20:5"}, constants={"headway_s": "2", "period_s": "10"},
     ),
-    Group(
+    CaseGroup(
         id="blocked-lane", paragraph="4.2", x="offset_m", y="distance_m",
         axes={"offset_m": "-2:2:0.5", "distance_m": "50:125:25"}, constants={},
     ),
-    Group(
+    CaseGroup(
         id="multiple-targets", paragraph="4.2", x="offset_m", y="between_m",
         axes={"offset_m": "-2:2:0.5", "between_m": "1:21:5"}, constants={"distance_m": "100"},
     ),
-    Group(
+    CaseGroup(
         id="pedestrian", paragraph="4.2", x="distance_m", y="impact_m",
         axes={"distance_m": "20:100:10", "impact_m": "-0.2:0.2:0.1"}, constants={"walk_kmh": "5", "from_side": "1"},
         models=(), why_not="the models do not apply to persons",
     ),
-    Group(
+    CaseGroup(
         id="detection-range", paragraph="4.6", x="seen_m", y="offset_m",
         axes={"seen_m": "20:70:5", "offset_m": "-5.25|0|5.25"}, constants={"distance_m": "150"},
     ),
 )  # fmt: skip
 
-_SCORECARD_SUITES: Mapping[str, tuple[Group, ...]] = {"r157": _R157}
+_SCORECARD_SUITES: Mapping[str, tuple[CaseGroup, ...]] = {"r157": _R157}
 """The groups of each suite of cases, by name."""
 
 
-def groups_of(suite: str, names: Sequence[str] = ()) -> tuple[Group, ...]:
+def groups_of(suite: str, names: Sequence[str] = ()) -> tuple[CaseGroup, ...]:
     """Return the groups of a suite; with names, only these groups.
 
     Raises:
@@ -128,8 +128,8 @@ def groups_of(suite: str, names: Sequence[str] = ()) -> tuple[Group, ...]:
 
 
 def entries_of(
-    groups: Sequence[Group], agent: str, speeds: Sequence[int], *, grid: bool, options: Given
-) -> Iterator[tuple[Group, SuiteEntry]]:
+    groups: Sequence[CaseGroup], agent: str, speeds: Sequence[int], *, grid: bool, options: Given
+) -> Iterator[tuple[CaseGroup, SuiteEntry]]:
     """Yield the hunts that run the cases of some groups.
 
     Speeds are those at the beginning, in km/h. Without ``grid``, the boundary between crashes and survived cases is
@@ -164,7 +164,7 @@ def entries_of(
             )
 
 
-def _parts(group: Group, speeds: Sequence[int]) -> Iterator[tuple[str, Mapping[str, str]]]:
+def _parts(group: CaseGroup, speeds: Sequence[int]) -> Iterator[tuple[str, Mapping[str, str]]]:
     """Yield the name and the remaining arguments of each hunt of a group.
 
     A cut-in needs a slower vehicle, so it has a hunt for each speed.
@@ -240,7 +240,7 @@ class Share:
 class ScorecardHunt:
     """The cases of one hunt: which ran, how they ended, and how the models end."""
 
-    group: Group  # the group of the cases
+    group: CaseGroup  # the group of the cases
     state: HuntState  # state of the hunt
     axes: Mapping[str, tuple[Value, ...]]  # the values of each argument that varies, in the order of the names
     constants: Mapping[str, Value]  # the other arguments of the scenario
@@ -406,7 +406,7 @@ def run_scorecard(
     return Scorecard(suite, agent, grid=grid, hunts=tuple(hunts))
 
 
-def _read(group: Group, directory: Path) -> ScorecardHunt:
+def _read(group: CaseGroup, directory: Path) -> ScorecardHunt:
     results = HuntResults(directory)
     settings = results.settings
     space = {name: settings.space["", name] for name in sorted(settings.scenario_arguments)}

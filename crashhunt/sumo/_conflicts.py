@@ -38,7 +38,7 @@ class Conflict(NamedTuple):
     link: LaneLink | None  # the other path; None for a crossing, which persons use in both directions
 
 
-class Approach(NamedTuple):
+class ConflictApproach(NamedTuple):
     """A lane on which an actor can be that takes a conflicting path."""
 
     conflict: Conflict
@@ -53,7 +53,7 @@ class Conflicts:
     def __init__(self, graph: LaneGraph) -> None:
         self._graph = graph
         self._rules = {lane: (one, index) for one in graph.rules.values() for index, lane in enumerate(one.inside)}
-        self._found: dict[str, dict[str, list[Approach]]] = {}
+        self._found: dict[str, dict[str, list[ConflictApproach]]] = {}
 
     def prepare(self) -> None:
         """Find the conflicts of all paths, so that trials in forks of this process need not; in a limited time."""
@@ -64,7 +64,7 @@ class Conflicts:
                     return
                 self.around(link)
 
-    def around(self, link: LaneLink) -> dict[str, list[Approach]]:
+    def around(self, link: LaneLink) -> dict[str, list[ConflictApproach]]:
         """Return the lanes from which actors come into conflict with a path, by id; the path begins at its stop line.
 
         Args:
@@ -76,10 +76,10 @@ class Conflicts:
             found = self._found[last] = self._made(link, last)
         return found
 
-    def _made(self, link: LaneLink, last: str) -> dict[str, list[Approach]]:
+    def _made(self, link: LaneLink, last: str) -> dict[str, list[ConflictApproach]]:
         graph = self._graph
         rule = next((self._rules[lane] for lane in reversed(link.inside) if lane in self._rules), None)
-        found: dict[str, list[Approach]] = {}
+        found: dict[str, list[ConflictApproach]] = {}
         if rule is None:
             return found
         junction, own = rule
@@ -99,20 +99,20 @@ class Conflicts:
                 found.setdefault(name, []).append(approach)
         return found
 
-    def _approaches(self, conflict: Conflict, lane: GraphLane) -> Iterator[tuple[str, Approach]]:
+    def _approaches(self, conflict: Conflict, lane: GraphLane) -> Iterator[tuple[str, ConflictApproach]]:
         graph, link = self._graph, conflict.link
         if link is None:
-            yield lane.id, Approach(conflict, 0.0, ("", ""), -1)
+            yield lane.id, ConflictApproach(conflict, 0.0, ("", ""), -1)
             return
         source = graph.lanes[conflict.source]
         edges = source.edge, graph.lanes[link.target].edge
         offset = 0.0
         for inside in link.inside:
-            yield inside, Approach(conflict, offset, edges, -1)
+            yield inside, ConflictApproach(conflict, offset, edges, -1)
             offset += graph.length(inside)
         for neighbor in graph.edges[source.edge]:
             if neighbor is source or not any(graph.lanes[one.target].edge == edges[1] for one in neighbor.links):
-                yield neighbor.id, Approach(conflict, -neighbor.data.length_m, edges, 0)
+                yield neighbor.id, ConflictApproach(conflict, -neighbor.data.length_m, edges, 0)
         # Edges further upstream, each with the shortest distance. An actor may still change lanes before the junction.
         waiting, known = [(source, -source.data.length_m, 0)], {source.edge}
         while waiting:
@@ -124,11 +124,11 @@ class Conflicts:
                 place = offset
                 for inside in reversed(entry.inside):
                     place -= graph.length(inside)
-                    yield inside, Approach(conflict, place, edges, back + 1)
+                    yield inside, ConflictApproach(conflict, place, edges, back + 1)
                 if before.edge not in known:
                     known.add(before.edge)
                     for neighbor in graph.edges[before.edge]:
-                        yield neighbor.id, Approach(conflict, place - neighbor.data.length_m, edges, back + 1)
+                        yield neighbor.id, ConflictApproach(conflict, place - neighbor.data.length_m, edges, back + 1)
                     waiting.append((before, place - before.data.length_m, back + 1))
 
     def _area(self, own: tuple[str, ...], other: tuple[str, ...]) -> tuple[float, float, float, float] | None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.native import Draft
-    from crashhunt.sumo._reader_protocol import Moment, ReaderSetup
+    from crashhunt.sumo._reader_protocol import AgentMoment, ReaderSetup
     from crashhunt.world import Actor
 
 _BRAKE_LIGHT, _RIGHT, _LEFT, _HAZARD = 8, 1, 2, 4  # bits of SUMO's signals
@@ -68,11 +68,11 @@ class EgoReader(Reader):
         self._place: tuple[float, float] | None = None
         self._driven_m = 0.0
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the columns of ``ego``."""
         return np.array(self._values(moment))
 
-    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+    def write(self, draft: Draft, place: int, moment: AgentMoment) -> None:
         """Write the columns of ``ego``."""
         setup = self._setup
         if setup.steering is None and not setup.graph.is_left_hand:
@@ -81,7 +81,7 @@ class EgoReader(Reader):
                 return
         draft.put(place, self._values(moment))
 
-    def _values(self, moment: Moment) -> tuple[float, ...]:
+    def _values(self, moment: AgentMoment) -> tuple[float, ...]:
         setup, scene, row = self._setup, moment.scene, moment.row
         agent, actor = setup.agent, scene.roster.actors[row]
         heading, speed = scene.headings[row], scene.speeds[row]
@@ -136,7 +136,7 @@ class ActorsReader(Reader):
             kinds[:], ids[:] = [kind_number(actor.kind) for actor in actors], [actor.id for actor in actors]
             self._actors = actors
 
-    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+    def write(self, draft: Draft, place: int, moment: AgentMoment) -> None:
         """Write the columns of ``actors``."""
         scene = moment.scene
         self.enter(scene.roster.actors)
@@ -145,7 +145,7 @@ class ActorsReader(Reader):
         if not (is_usual and draft.actors(place, self._who, self._limits, (self._speeds, self._rows), facts)):
             draft.put_array(place, self.observe(moment))
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the columns of ``actors``."""
         scene, row = moment.scene, moment.row
         headings, speeds, actors = scene.headings, scene.speeds, scene.roster.actors

@@ -330,7 +330,7 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
     return LaneGraph(read_network(path, with_junctions=True))
 
 
-class Signal(NamedTuple):
+class RouteSignal(NamedTuple):
     """A traffic light on a route."""
 
     distance_m: float  # distance from the start of the lane for which it was looked up, in m
@@ -461,14 +461,14 @@ class RouteGuide:
         step = self.step(number, lane.id)
         return step.rest_m if step is not None else 0.0
 
-    def signals(self, number: int, lane: GraphLane, limit: int) -> list[Signal]:
+    def signals(self, number: int, lane: GraphLane, limit: int) -> list[RouteSignal]:
         """Return the next traffic lights ahead of the start of a lane, along the lane as long as it leads on."""
-        found: list[Signal] = []
+        found: list[RouteSignal] = []
         distance = 0.0
         for current, _, link in self.walk(number, lane, is_best=False):
             distance += current.data.length_m
             if link is not None and link.signal and not current.is_internal:
-                found.append(Signal(distance, link.signal, link.signal_index))
+                found.append(RouteSignal(distance, link.signal, link.signal_index))
                 if len(found) == limit:
                     break
         return found

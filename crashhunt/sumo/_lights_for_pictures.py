@@ -10,7 +10,7 @@ from libsumo import _libsumo as sumo
 from crashhunt.simulators import Lights
 from crashhunt.sumo._ego_and_actors import lights_of
 from crashhunt.sumo._observing import ObservedParts
-from crashhunt.sumo._reader_protocol import Moment
+from crashhunt.sumo._reader_protocol import AgentMoment
 from crashhunt.sumo._signal_readers import SIGNAL_STATES
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class LightReader:
             row = scene.roster.index.get(agent)
             if row is None or agent not in present:
                 continue
-            found = self._parts.read(agent, Moment(scene=scene, row=row, lane=lane, hidden=frozenset()))
+            found = self._parts.read(agent, AgentMoment(scene=scene, row=row, lane=lane, hidden=frozenset()))
             columns = self._parts.layouts[agent].columns
             rows = {
                 name: [

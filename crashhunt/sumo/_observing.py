@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from crashhunt.scenario import Scenario
     from crashhunt.sumo._lane_graph import LaneGraph
     from crashhunt.sumo._lane_paths import NearLanesOf
-    from crashhunt.sumo._reader_protocol import Moment, Reader
+    from crashhunt.sumo._reader_protocol import AgentMoment, Reader
     from crashhunt.world import Roster
 
 READERS: Mapping[str, type[Reader]] = {
@@ -181,7 +181,7 @@ class ObservedParts:
         outlines = obstacle_outlines()
         return ObstacleOutlines(outlines.values()) if outlines else None
 
-    def observe(self, agent: str, moment: Moment) -> NDArray[np.generic]:
+    def observe(self, agent: str, moment: AgentMoment) -> NDArray[np.generic]:
         """Return the recorded array of an agent's observation."""
         layout = self.layouts[agent]
         if agent in self._casters:
@@ -210,7 +210,7 @@ class ObservedParts:
         """Return what the core writes an agent's observations into; None if it does not."""
         return self._drafts[agent][0] if agent in self._drafts else None
 
-    def read(self, agent: str, moment: Moment) -> dict[str, NDArray[np.generic]]:
+    def read(self, agent: str, moment: AgentMoment) -> dict[str, NDArray[np.generic]]:
         """Return the parts of an agent's observation, before modifiers."""
         return {name: reader.observe(moment) for name, reader in self._readers[agent].items()}
 

@@ -79,7 +79,7 @@ class ReaderSetup:
 
 
 @dataclass(slots=True)
-class Moment:
+class AgentMoment:
     """The state after a step, as seen by one agent. All readers of the agent receive the same object in a step."""
 
     scene: Scene
@@ -88,7 +88,7 @@ class Moment:
     hidden: frozenset[str]  # identifiers of the actors that the agent does not see, as in scenes
 
 
-class Place(NamedTuple):
+class NetworkPlace(NamedTuple):
     """Where a vehicle is on the network."""
 
     lane: GraphLane  # its lane, or its last lane if it is off every lane
@@ -105,8 +105,8 @@ class Places:
     def __init__(self, graph: LaneGraph, agent: str) -> None:
         self._graph, self._agent = graph, agent
         self._class = sumo.vehicle_getVehicleClass(agent)
-        self._moment: Moment | None = None
-        self._place: Place | None = None
+        self._moment: AgentMoment | None = None
+        self._place: NetworkPlace | None = None
         self._route = ""
         self._guide = graph.guide((), self._class)
 
@@ -115,7 +115,7 @@ class Places:
         """The class of the vehicle."""
         return str(self._class)
 
-    def find(self, moment: Moment) -> Place | None:
+    def find(self, moment: AgentMoment) -> NetworkPlace | None:
         """Return where the vehicle is; None if its lane is not in the network file."""
         if moment is not self._moment:
             self._moment, self._place = moment, self._found(moment)
@@ -130,7 +130,7 @@ class Places:
             outline.flags.writeable = False
         return replace(guide.road_map(number, self._graph.lanes.get(name)), obstacles=MappingProxyType(outlines))
 
-    def _found(self, moment: Moment) -> Place | None:
+    def _found(self, moment: AgentMoment) -> NetworkPlace | None:
         agent, scene, row = self._agent, moment.scene, moment.row
         lane = self._graph.lanes.get(moment.lane)
         if lane is None:
@@ -145,7 +145,7 @@ class Places:
         position = sumo.vehicle_getLanePosition(agent)
         if position < 0.0:  # off every lane
             position = _position_on(self._graph, lane, *scene.points[row])
-        return Place(lane, position, self._guide, number, *center_of(scene, row))
+        return NetworkPlace(lane, position, self._guide, number, *center_of(scene, row))
 
 
 def _position_on(graph: LaneGraph, lane: GraphLane, x: float, y: float) -> float:
@@ -166,20 +166,20 @@ class Reader:
     def __init__(self, setup: ReaderSetup) -> None:
         self._setup = setup
 
-    def observe(self, moment: Moment) -> NDArray[np.generic]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.generic]:
         """Return the part after the last step, as a new array; crashhunt calls this method once per step, from step 0.
 
         The array has the shape and the data type of the part. The method changes nothing in the simulation.
         """
         raise NotImplementedError
 
-    def _actors_near(self, moment: Moment) -> list[NearActor]:
+    def _actors_near(self, moment: AgentMoment) -> list[NearActor]:
         """Return the actors in the rows of a part with one row per actor, the nearest first."""
         setup = self._setup
         radius = setup.settings["radius"]
         return nearest_actors(moment.scene, moment.row, hidden=moment.hidden, radius=radius, limit=setup.limit)
 
-    def write(self, draft: Draft, place: int, moment: Moment) -> None:
+    def write(self, draft: Draft, place: int, moment: AgentMoment) -> None:
         """Write the same values into a draft of the compiled core, which replaces a call of `observe`."""
         draft.put_array(place, self.observe(moment).astype(np.float64, copy=False))
 
@@ -187,16 +187,16 @@ class Reader:
 class RowsReader(Reader):
     """Reads a part as rows of numbers; the rows after the last one are 0."""
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the columns of the part."""
         found = np.zeros(self._setup.shape)
         for number, values in enumerate(self._rows(moment)):
             found[number] = values
         return found
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of the part."""
         draft.put(at, tuple([value for row in self._rows(moment) for value in row]))
 
-    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+    def _rows(self, moment: AgentMoment) -> list[tuple[float, ...]]:
         raise NotImplementedError

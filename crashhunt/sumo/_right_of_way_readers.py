@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.native import Draft, Streams
-    from crashhunt.sumo._conflicts import Approach, Conflict
+    from crashhunt.sumo._conflicts import Conflict, ConflictApproach
     from crashhunt.sumo._lane_graph import LaneLink
-    from crashhunt.sumo._reader_protocol import Moment, Place, ReaderSetup
+    from crashhunt.sumo._reader_protocol import AgentMoment, NetworkPlace, ReaderSetup
     from crashhunt.world import Scene
 
     Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class RightOfWayReader(RowsReader):
         self._takes: dict[tuple[int, str, int, str], list[tuple[Conflict, float]]] = {}
         self._streams: dict[int, Streams] = {}  # of the core, by the identity of the approaches
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``right_of_way``."""
         place, core = self._setup.places.find(moment), self._setup.core
         path = path_from(place) if place is not None else None
@@ -62,7 +62,7 @@ class RightOfWayReader(RowsReader):
         if not (is_usual and draft.right_of_way(at, streams, facts)):
             super().write(draft, at, moment)
 
-    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+    def _rows(self, moment: AgentMoment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
         if place is None or path is None:
@@ -110,7 +110,7 @@ class RightOfWayReader(RowsReader):
         return conflict._replace(other_begin_m=begin, other_end_m=end), length - position
 
     def _taken(
-        self, name: str, scene: Scene, row: int, approaches: Mapping[str, list[Approach]]
+        self, name: str, scene: Scene, row: int, approaches: Mapping[str, list[ConflictApproach]]
     ) -> tuple[Sequence[tuple[Conflict, float]], float]:
         """Return the conflicting paths that an actor takes, and the position of its front on its lane, in m.
 
@@ -137,7 +137,7 @@ class RightOfWayReader(RowsReader):
         return found, position
 
     def _taken_by(
-        self, approaches: Mapping[str, list[Approach]], name: str, lane: str, number: int, _: str
+        self, approaches: Mapping[str, list[ConflictApproach]], name: str, lane: str, number: int, _: str
     ) -> list[tuple[bool, float, float, float, float, float, str, int]]:
         """Return the conflicting paths that a vehicle takes, for the core."""
         found = []
@@ -165,7 +165,7 @@ class RightOfWayReader(RowsReader):
         return True
 
 
-def _paths_of(vehicle: str, approaches: Sequence[Approach], number: int) -> list[tuple[Conflict, float]]:
+def _paths_of(vehicle: str, approaches: Sequence[ConflictApproach], number: int) -> list[tuple[Conflict, float]]:
     """Return the conflicting paths that a vehicle takes, each with the distance in m from its stop line to the lane."""
     edges = tuple(sumo.vehicle_getRoute(vehicle))
     return [
@@ -175,7 +175,7 @@ def _paths_of(vehicle: str, approaches: Sequence[Approach], number: int) -> list
     ]
 
 
-def path_across(place: Place) -> tuple[LaneLink, float] | None:
+def path_across(place: NetworkPlace) -> tuple[LaneLink, float] | None:
     """Return the path across the next junction, or the present one, and the distance to its stop line, in m.
 
     The distance is negative behind the stop line. The result is None if the lane does not lead along the route.
@@ -184,7 +184,7 @@ def path_across(place: Place) -> tuple[LaneLink, float] | None:
     return None if found is None else (found[0], found[1] - place.position_m)
 
 
-def path_from(place: Place) -> tuple[LaneLink, float] | None:
+def path_from(place: NetworkPlace) -> tuple[LaneLink, float] | None:
     """Return the path across the next junction, or the present one, and the stop line's position on the lane, in m."""
     lane = place.lane
     link = place.guide.link(place.number, lane) if place.number >= 0 else None
@@ -201,7 +201,7 @@ def path_from(place: Place) -> tuple[LaneLink, float] | None:
 class CrossingsReader(RowsReader):
     """Reads the pedestrian crossings within the next junction, and the persons near them."""
 
-    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+    def _rows(self, moment: AgentMoment) -> list[tuple[float, ...]]:
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
         if path is None:
@@ -242,7 +242,7 @@ def _distance_to(line: Array, x: float, y: float) -> float:
 class StopLineReader(Reader):
     """Reads the stop line of the next junction."""
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the columns of ``stop_line``."""
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
@@ -250,7 +250,7 @@ class StopLineReader(Reader):
             return np.zeros(self._setup.shape)
         return np.array(self._values(*path), float)
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``stop_line``."""
         place = self._setup.places.find(moment)
         path = path_from(place) if place is not None else None

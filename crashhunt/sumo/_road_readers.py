@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from crashhunt.simulators import RequestedPart
     from crashhunt.sumo._lane_graph import GraphLane, LaneGraph, RouteGuide
     from crashhunt.sumo._lane_paths import LanePath, NearLanesOf
-    from crashhunt.sumo._reader_protocol import Moment, Place, ReaderSetup
+    from crashhunt.sumo._reader_protocol import AgentMoment, NetworkPlace, ReaderSetup
 
     Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class LanesReader(Reader):
         self._key: tuple[object, ...] = ()
         self._block: _Block | None = None
         self._in_core: LaneBlock | None = None
-        self._place: Place | None = None
+        self._place: NetworkPlace | None = None
         self._size = self._lanes, points, self._sampling.before, self._sampling.stride, NEAR_M, SQUARE_M
 
     @staticmethod
@@ -61,7 +61,7 @@ class LanesReader(Reader):
         """Prepare what vehicles of a class share; `near` receives it."""
         _near_lanes(graph, _sampling_of(request), vehicle_class, near).prepare()
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the columns of ``lanes``."""
         place = self._setup.places.find(moment)
         if place is None:
@@ -88,7 +88,7 @@ class LanesReader(Reader):
         block.rows.take(rows, axis=0, out=found[: len(chosen)], mode="clip")
         return found
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``lanes``."""
         place = self._place = self._setup.places.find(moment)
         if place is not None and not draft.lanes(at, self._block_at, self._size):
@@ -108,7 +108,7 @@ class LanesReader(Reader):
             self._in_core = core.LaneBlock(paths, *self._middle, self._window)
         return self._in_core
 
-    def _move_to(self, place: Place, square: tuple[int, int]) -> None:
+    def _move_to(self, place: NetworkPlace, square: tuple[int, int]) -> None:
         """Set the square and the lane, and delete the candidates of another square or lane."""
         key = place.lane, id(place.guide), place.number, square
         if key != self._key:
@@ -116,12 +116,12 @@ class LanesReader(Reader):
             self._middle = (square[0] + 0.5) * SQUARE_M, (square[1] + 0.5) * SQUARE_M
             self._block = self._in_core = None
 
-    def _limit(self, place: Place) -> float:
+    def _limit(self, place: NetworkPlace) -> float:
         """Return the largest squared distance of a lane, without the term that all points have in common, in m²."""
         dx, dy = place.x - self._middle[0], place.y - self._middle[1]
         return NEAR_M * NEAR_M - dx * dx - dy * dy
 
-    def _candidates(self, place: Place) -> list[LanePath | None]:
+    def _candidates(self, place: NetworkPlace) -> list[LanePath | None]:
         """Return the paths of the own lane, the left and the right lane, then of the lanes near the square."""
         graph, places, lane = self._graph, self._setup.places, place.lane
         own = self._own_paths(place)
@@ -139,7 +139,7 @@ class LanesReader(Reader):
         around += [path for distance, _, path in near if distance <= limit]
         return around
 
-    def _own_paths(self, place: Place) -> LanePaths:
+    def _own_paths(self, place: NetworkPlace) -> LanePaths:
         """Return the paths of the lanes on the vehicle's own road, which follow its route if they can."""
         key = id(place.guide), place.number
         found = self._paths.get(key)
@@ -231,7 +231,7 @@ class RouteReader(Reader):
         self._steps = np.arange(points) * self._sampling.stride
         self._paths: dict[tuple[int, int], LanePaths] = {}
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the columns of ``route``."""
         found = np.zeros(self._setup.shape)
         place = self._setup.places.find(moment)
@@ -245,7 +245,7 @@ class RouteReader(Reader):
         found[: len(rows)] = rows[:, _ROUTE_COLUMNS]
         return found
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``route``."""
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
@@ -255,14 +255,14 @@ class RouteReader(Reader):
         if self._before or not draft.route(at, path.rows, window):  # the core writes the points ahead only
             super().write(draft, at, moment)
 
-    def _path(self, place: Place) -> LanePath:
+    def _path(self, place: NetworkPlace) -> LanePath:
         key = id(place.guide), place.number
         paths = self._paths.get(key)
         if paths is None:
             paths = self._paths[key] = self._made(place)
         return paths.path(place.lane)
 
-    def _made(self, place: Place) -> LanePaths:
+    def _made(self, place: NetworkPlace) -> LanePaths:
         guide, number = place.guide, place.number
         before = guide.edges[number - 1] if number > 0 and not place.lane.is_internal else ""
         graph, vehicle_class = guide.graph, guide.vehicle_class
@@ -280,7 +280,7 @@ _ROUTE_COLUMNS = (0, 1, 2, 3, 5, 6)
 class RouteStateReader(Reader):
     """Reads the state of the controlled vehicle on its route."""
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the columns of ``route_state``."""
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
@@ -289,7 +289,7 @@ class RouteStateReader(Reader):
         left = -place.position_m + after
         return np.array((max(0.0, rest + left), changes, max(0.0, run + left), *place.guide.goal))
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``route_state``."""
         place = self._setup.places.find(moment)
         if place is None or place.number < 0:
@@ -300,7 +300,7 @@ class RouteStateReader(Reader):
             super().write(draft, at, moment)
 
     @staticmethod
-    def _distances(place: Place) -> tuple[float, int, float, float]:
+    def _distances(place: NetworkPlace) -> tuple[float, int, float, float]:
         """Return what is left of the route behind the end of the lane, and the changes to its best lane.
 
         Returns:
@@ -330,11 +330,11 @@ class RouteStateReader(Reader):
 class SpeedLimitReader(Reader):
     """Reads the speed limit of the controlled vehicle's lane."""
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the speed limit, which can differ from that of the network file while a sign changes it."""
         return np.array((float(sumo.lane_getMaxSpeed(moment.lane)),))
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the speed limit."""
         if not draft.speed_limit(at):
             super().write(draft, at, moment)

@@ -22,7 +22,7 @@ from crashhunt.simulators import (
     with_range_noise,
 )
 from crashhunt.sumo._lane_paths import LanePath, NearLanes, Sampling
-from crashhunt.sumo._reader_protocol import Moment, Reader, ReaderSetup
+from crashhunt.sumo._reader_protocol import AgentMoment, Reader, ReaderSetup
 from crashhunt.world import is_person
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class PredictionsReader(Reader):
         self._times = setup.settings["interval"] * np.arange(1.0, setup.shape[1] + 1.0)
         self._lanes: dict[str, NearLanes] = {}
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the columns of ``predictions``."""
         settings, near = self._setup.settings, self._actors_near(moment)
         share, interval, scene = self._setup.reference_share, settings["interval"], moment.scene
@@ -110,7 +110,7 @@ def _along(
 class CovarianceReader(Reader):
     """Reads the part ``prediction_covariance``."""
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the columns of ``prediction_covariance``."""
         return covariances_of(moment.scene, self._actors_near(moment), self._setup.settings, shape=self._setup.shape)
 
@@ -122,7 +122,7 @@ class ActorIdsReader(Reader):
         super().__init__(setup)
         self._numbers = ActorNumbers()
 
-    def observe(self, moment: Moment) -> NDArray[np.int64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.int64]:
         """Return the values of ``actor_ids``."""
         return self._numbers.of(moment.scene, self._actors_near(moment), self._setup.limit)
 
@@ -135,7 +135,7 @@ class RangesReader(Reader):
         self._reach_m = setup.settings["range"]
         self._caster = RayCaster(int(setup.settings["rays"]), self._reach_m, setup.obstacles)
 
-    def observe(self, moment: Moment) -> NDArray[np.float64]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.float64]:
         """Return the values of ``lidar2d``."""
         scene, row = moment.scene, moment.row
         longest = max(scene.roster.lengths)
@@ -156,20 +156,20 @@ class _RasterReader(Reader):
         self._raster = Raster(*shape, settings["resolution"])
         self._nothing = np.zeros(shape, bool)
 
-    def _road(self, moment: Moment) -> NDArray[np.bool_]:
+    def _road(self, moment: AgentMoment) -> NDArray[np.bool_]:
         x, y = center_of(moment.scene, moment.row)
         reach = self._raster.reach_m + _MAX_HALF_WIDTH_M
         near = [self._graph.lanes[name] for _, name in self._graph.near(x, y, reach, self._vehicle_class)]
         lanes = [(self._graph.lines(lane).center, lane.data.width_m) for lane in near]
         return self._raster.on_lanes(moment.scene, moment.row, lanes)
 
-    def _actors(self, moment: Moment) -> NDArray[np.bool_]:
+    def _actors(self, moment: AgentMoment) -> NDArray[np.bool_]:
         scene, row = moment.scene, moment.row
         reach = self._raster.reach_m + max(scene.roster.lengths)
         near = nearest_actors(scene, row, hidden=moment.hidden, radius=reach)
         return self._raster.occupied(scene, row, [one.row for one in near])
 
-    def _obstacles(self, moment: Moment) -> NDArray[np.bool_]:
+    def _obstacles(self, moment: AgentMoment) -> NDArray[np.bool_]:
         known = self._setup.obstacles
         if known is None:
             return self._nothing
@@ -179,7 +179,7 @@ class _RasterReader(Reader):
 class GridReader(_RasterReader):
     """Reads the part ``grid``."""
 
-    def observe(self, moment: Moment) -> NDArray[np.uint8]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.uint8]:
         """Return the layers of ``grid``."""
         return np.stack((self._actors(moment) | self._obstacles(moment), self._road(moment))).astype(np.uint8)
 
@@ -187,7 +187,7 @@ class GridReader(_RasterReader):
 class ImageReader(_RasterReader):
     """Reads the part ``image``."""
 
-    def observe(self, moment: Moment) -> NDArray[np.uint8]:
+    def observe(self, moment: AgentMoment) -> NDArray[np.uint8]:
         """Return the picture of ``image``."""
         own = self._raster.occupied(moment.scene, moment.row, [moment.row])
         return picture(self._road(moment), self._obstacles(moment), self._actors(moment), own)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from libsumo import _libsumo as sumo
 
-from crashhunt.sumo._reader_protocol import NEVER_S, Moment, Reader, ReaderSetup, RowsReader
+from crashhunt.sumo._reader_protocol import NEVER_S, AgentMoment, Reader, ReaderSetup, RowsReader
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.native import Draft
-    from crashhunt.sumo._lane_graph import Signal
+    from crashhunt.sumo._lane_graph import RouteSignal
 
     Array = NDArray[np.float64]
 
@@ -29,15 +29,15 @@ class SignalsReader(RowsReader):
 
     def __init__(self, setup: ReaderSetup) -> None:
         super().__init__(setup)
-        self._ahead: dict[tuple[int, int, str], list[Signal]] = {}
+        self._ahead: dict[tuple[int, int, str], list[RouteSignal]] = {}
         self._seen: dict[tuple[str, int], list[float]] = {}  # state of the lights ahead, and since when
 
-    def write(self, draft: Draft, at: int, moment: Moment) -> None:
+    def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``signals``."""
         if not draft.signals(at, self._lights(moment), self._setup.step_length_s):
             super().write(draft, at, moment)
 
-    def _rows(self, moment: Moment) -> list[tuple[float, ...]]:
+    def _rows(self, moment: AgentMoment) -> list[tuple[float, ...]]:
         found: list[tuple[float, ...]] = []
         time_s, place = moment.scene.time_s, self._setup.places.find(moment)
         for distance, light, link, last in self._lights(moment):
@@ -48,7 +48,7 @@ class SignalsReader(RowsReader):
             found.append((1.0, state, distance - place.position_m, time_s - last[1]))
         return found
 
-    def _lights(self, moment: Moment) -> list[tuple[float, str, int, list[float]]]:
+    def _lights(self, moment: AgentMoment) -> list[tuple[float, str, int, list[float]]]:
         """Return the lights ahead: distance from the start of the lane, id, link, and the state with its beginning.
 
         The core may change the states.
@@ -97,7 +97,7 @@ def _phases(light: str) -> tuple[Sequence[Any], int]:
 class SwitchTimesReader(Reader):
     """Reads when the next traffic lights on the route change their states."""
 
-    def observe(self, moment: Moment) -> Array:
+    def observe(self, moment: AgentMoment) -> Array:
         """Return the values of ``time_to_switch``."""
         found = np.zeros(self._setup.shape)
         place = self._setup.places.find(moment)

@@ -46,7 +46,7 @@ from crashhunt.sumo._loading import VERSION, Loading, keep_xml_ready
 from crashhunt.sumo._observing import ObservedParts
 from crashhunt.sumo._omitted_demand import OmittedDemand
 from crashhunt.sumo._options import SumoSetup
-from crashhunt.sumo._reader_protocol import Moment
+from crashhunt.sumo._reader_protocol import AgentMoment
 from crashhunt.sumo._scene_reader import Sight
 from crashhunt.sumo._scripted import ScriptedSight, manoeuvre_paths, place_agents
 from crashhunt.sumo._surroundings import nearest_ahead_of, surroundings_of, unregulated_junctions
@@ -515,7 +515,7 @@ class SumoSimulator:
 
     def _perceive(self, scene: Scene, row: int, lane: str) -> NDArray[np.generic]:
         """Return the parts that the only agent observes after a step, which the core may yet leave to this object."""
-        moment = Moment(scene=scene, row=row, lane=lane, hidden=frozenset())
+        moment = AgentMoment(scene=scene, row=row, lane=lane, hidden=frozenset())
         return self._parts.observe(self.agents[0], moment)
 
     def _infos(self, agents: Iterable[str]) -> dict[str, Info]:
@@ -591,7 +591,7 @@ class SumoSimulator:
             perceived = None if self.at_once is None else self.at_once.core.perceived(self._steps)
             if perceived is not None:  # readers keep state, so they read each step once
                 return perceived
-            moment = Moment(
+            moment = AgentMoment(
                 scene=self._scene, row=row, lane=f"{edge}_{lane}", hidden=self._kinematics.hidden_from(agent)
             )
             return self._parts.observe(agent, moment)

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     )
     from ._call_signature import (
         FILLED_BY_NAME as FILLED_BY_NAME,
+        CallSignature as CallSignature,
         DeclaresArguments as DeclaresArguments,
         PrefersAction as PrefersAction,
         ReturnsActions as ReturnsActions,
-        Signature as Signature,
         signature_of as signature_of,
     )
     from ._disturbance import (

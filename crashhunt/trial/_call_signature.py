@@ -40,7 +40,7 @@ class DeclaresObservation(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Signature:
+class CallSignature:
     """The signature of a factory: the arguments that it accepts.
 
     Args:
@@ -67,7 +67,7 @@ class Signature:
     unread: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Signature:
+    def from_json(cls, data: Mapping[str, Any]) -> CallSignature:
         """Rebuild a signature from the data of `to_json`.
 
         Raises:
@@ -137,7 +137,7 @@ class ReturnsActions(Protocol):
 class DeclaresArguments(typing.Protocol):
     """A factory that reports its arguments itself, such as that of a program."""
 
-    def declared_signature(self, agent: str = "", simulator: Any = None, *, limit_s: float = 0.0) -> Signature:
+    def declared_signature(self, agent: str = "", simulator: Any = None, *, limit_s: float = 0.0) -> CallSignature:
         """Return the arguments of the factory.
 
         Args:
@@ -147,7 +147,7 @@ class DeclaresArguments(typing.Protocol):
         """
 
 
-def signature_of(factory: Callable[..., object]) -> Signature:
+def signature_of(factory: Callable[..., object]) -> CallSignature:
     """Return the arguments of a factory, read from its signature.
 
     A parameter may be annotated ``Annotated[float, Argument(...)]`` to define which values a hunt tries. Parameters in
@@ -159,7 +159,7 @@ def signature_of(factory: Callable[..., object]) -> Signature:
     actions = _names_in(factory.actions) if supports(factory, ReturnsActions) else ()
     observation = _declared_parts(factory)
     declared = replace(
-        Signature({}, open=False, given=()), action=action, actions=actions, observation=observation,
+        CallSignature({}, open=False, given=()), action=action, actions=actions, observation=observation,
         unread={name: kind for name in ("action", "observation") if (kind := _type_of_unread(factory, name))},
     )  # fmt: skip
     if _takes_nothing(factory):

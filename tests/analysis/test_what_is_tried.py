@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.analysis import _minimization_candidates as _stages, fewest
 from crashhunt.analysis._delta_debugging import plainest
-from crashhunt.analysis._minimization_candidates import Minimizer, Part
+from crashhunt.analysis._minimization_candidates import Minimizer, RemainingActors
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.trial import ALL_AGENTS, Disturbance, Escape, TrialSpec
 from crashhunt.trial_reruns import OutOfTimeError, StoppedError
@@ -101,7 +101,7 @@ class Script:
 class Scripting:
     """Parts of a crash of 100 steps."""
 
-    whole, steps = Part(("ego",), OTHERS), 100
+    whole, steps = RemainingActors(("ego",), OTHERS), 100
 
     def spec(self, part):
         return TrialSpec(0, 1, {"ego": {}}, {}, 110, script=Script(part.others, part.agents))
@@ -462,7 +462,7 @@ def test_a_script_is_smaller_with_fewer_actors_or_agents_or_steps(names, agents,
 class TwoDrive(Scripting):
     """Two agents drive, and three others are there."""
 
-    whole = Part(("ego", "a"), ("b", "c", "d"))
+    whole = RemainingActors(("ego", "a"), ("b", "c", "d"))
 
 
 def test_an_agent_that_need_not_drive_is_moved():
@@ -471,9 +471,11 @@ def test_an_agent_that_need_not_drive_is_moved():
 
     rerun = crash(agents=("ego", "a"), other="c")
     search = Minimizer(rerun, Takes(crashes), "traffic")
-    assert search._fewest_moved(TwoDrive()) == Part(("ego",), ("a", "c"))
+    assert search._fewest_moved(TwoDrive()) == RemainingActors(("ego",), ("a", "c"))
     rerun.bundle.driver = "nobody"
-    assert Minimizer(rerun, Takes(crashes), "traffic")._fewest_moved(TwoDrive()) == Part(("ego", "a"), ("c",))
+    assert Minimizer(rerun, Takes(crashes), "traffic")._fewest_moved(TwoDrive()) == RemainingActors(
+        ("ego", "a"), ("c",)
+    )
     never = Minimizer(rerun, Takes(lambda spec: spec.script is None), "traffic")
     assert never._fewest_moved(TwoDrive()) is None
 
@@ -509,7 +511,7 @@ def test_fewer_are_enough_where_it_begins_later(others, others_from_step_60):
 def test_where_it_begins_later_pairs_with_which_it_crashed_are_tried_first():
     runs = Takes(lambda spec: False)
     search = Minimizer(crash(other="c"), runs, "traffic")
-    search._fewer_from_later_on(FromLaterOn(), Part(("ego",), ("a", "b", "c", "d"), 60))
+    search._fewer_from_later_on(FromLaterOn(), RemainingActors(("ego",), ("a", "b", "c", "d"), 60))
     tried = [(spec.max_steps, spec.script.names) for _, spec in runs.tried]
     groups = [(), ("c",), *(("c", name) for name in "abdefgh")]
     assert tried[: 3 * len(groups)] == [(step, group) for step in (60, 90, 1) for group in groups]
@@ -529,7 +531,7 @@ def test_the_nearest_are_those_of_the_last_scene_in_every_direction():
 class Many(Scripting):
     """Thirty others, and three steps with which it could begin."""
 
-    whole, steps = Part(("ego",), tuple(f"n{number}" for number in range(30))), 100
+    whole, steps = RemainingActors(("ego",), tuple(f"n{number}" for number in range(30))), 100
 
     def begins(self, agents):
         return [90, 60]
@@ -541,7 +543,7 @@ class Many(Scripting):
 def test_pairs_are_tried_with_so_many_that_were_near_and_no_more():
     runs = Takes(lambda spec: False)
     search = Minimizer(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
-    search._fewer_from_later_on(Many(), Part(("ego",), Many.whole.others[:5], 60))
+    search._fewer_from_later_on(Many(), RemainingActors(("ego",), Many.whole.others[:5], 60))
     pairs = {spec.script.names for _, spec in runs.tried if len(spec.script.names) == 2}
     assert pairs == {("n29", f"n{number}") for number in range(24)}
 
@@ -554,7 +556,7 @@ def test_with_few_left_no_other_beginning_is_tried():
 
     runs = Takes(crashes)
     search = Minimizer(crash(names=("ego", *Many.whole.others), other="n29"), runs, "traffic")
-    search._fewer_from_later_on(Many(), Part(("ego",), Many.whole.others[:9], 60))
+    search._fewer_from_later_on(Many(), RemainingActors(("ego",), Many.whole.others[:9], 60))
     assert (search.best.script.names, search.best.max_steps) == (("n3", "n5"), 60)
     assert not any(spec.max_steps != 60 and len(spec.script.names) > 2 for _, spec in runs.tried)
 
@@ -586,15 +588,15 @@ def test_a_script_may_take_a_second_longer_than_what_was_recorded():
     )
     rerun.recorded.steps = 49
     scripting = _stages.Scripting(rerun)
-    spec = scripting.spec(Part(("ego",), ()))
+    spec = scripting.spec(RemainingActors(("ego",), ()))
     assert (scripting.steps, spec.max_steps, spec.only) == (49, 59, None)
     assert spec.disturbances == (LATE,)
-    later = scripting.spec(Part(("ego",), (), begin=30))
+    later = scripting.spec(RemainingActors(("ego",), (), begin=30))
     assert later.max_steps == 29
     assert later.disturbances == (replace(LATE, step=10),)
-    assert scripting.spec(Part(("ego",), (), begin=40)).disturbances == ()
+    assert scripting.spec(RemainingActors(("ego",), (), begin=40)).disturbances == ()
     rerun.recorded.prologue = SimpleNamespace(step_length_s=2.5)
-    assert _stages.Scripting(rerun).spec(Part(("ego",), ())).max_steps == 50  # a step at least
+    assert _stages.Scripting(rerun).spec(RemainingActors(("ego",), ())).max_steps == 50  # a step at least
 
 
 class Lasting(Takes):

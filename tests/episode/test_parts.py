@@ -16,7 +16,7 @@ from crashhunt.base.plugins import CurrentFolder, locate
 from crashhunt.episode import Parts, WorkerSettings, _parts, require_origin, seal
 from crashhunt.scenario import load_scenario
 from crashhunt.simulators import ObservationLayout, parse_parts
-from crashhunt.trial import Signature
+from crashhunt.trial import CallSignature
 
 AGENT = """
 import random
@@ -85,7 +85,7 @@ def test_agents_are_given_what_they_ask_for(made):
 
 def test_agent_that_changes_its_columns_changes_only_its_own(made):
     parts = made()
-    parts._factories["ego"] = dict, Signature({}, open=True, given=("columns",))
+    parts._factories["ego"] = dict, CallSignature({}, open=True, given=("columns",))
     simulator = parts.simulator()
     simulator.observation_layouts = {"ego": ObservationLayout(parse_parts(("ego",), where=""))}
     parts.agent("ego", simulator, {})["columns"]["ego"].clear()
@@ -94,7 +94,7 @@ def test_agent_that_changes_its_columns_changes_only_its_own(made):
 
 def test_agent_is_given_the_masks_of_its_simulator(made):
     parts = made()
-    parts._factories["ego"] = dict, Signature({}, open=True, given=("action_masks",))
+    parts._factories["ego"] = dict, CallSignature({}, open=True, given=("action_masks",))
     simulator = parts.simulator()
     assert parts.agent("ego", simulator, {}) == {"action_masks": None}
     simulator.action_mask = lambda agent: f"mask of {agent}"
@@ -106,7 +106,7 @@ def test_notices_are_read_from_agents_of_crashhunt_only(made):
     for module in ("crashhunt.agents.some", "mine"):
         parts._factories["ego"] = (
             type("Policy", (), {"__module__": module, "notices": [module]}),
-            Signature({}, open=False, given=()),
+            CallSignature({}, open=False, given=()),
         )
         parts.agent("ego", parts.simulator(), {})
     assert [agent.notices for agent in parts.reporting_agents] == [["crashhunt.agents.some"]]

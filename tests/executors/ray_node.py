@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-from crashhunt.executors.ray._code_archive import Place
+from crashhunt.executors.ray._code_archive import NodeFolder
 from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.trial import TrialSpec
@@ -50,7 +50,7 @@ def node_works(settings, folder, monkeypatch):
     def make(*ends, slots=1):
         job = {"settings": settings.to_json(), "digest": "", "folders": {}, "home": "", "slots": slots}
         made.append(Work(job))
-        made[-1]._place = Place()
+        made[-1]._place = NodeFolder()
         made[-1]._pool = Pool(*ends)
         return made[-1]
 

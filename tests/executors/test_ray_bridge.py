@@ -16,8 +16,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor, _bridge, _executor
-from crashhunt.executors.ray._cluster import Found, Lost, Meant
-from crashhunt.executors.ray._messages import EndedTrial, News
+from crashhunt.executors.ray._cluster import ClusterNode, Meant, NodeLostError
+from crashhunt.executors.ray._messages import News, NodeTrial
 from crashhunt.scenario import Scenario
 from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 
@@ -50,7 +50,7 @@ class Made:
         for actor in self.actors:
             if actor.alive and actor.machine in taken and actor not in self.nowhere:
                 taken[actor.machine] += actor.slots
-        return {name: Found(name, name, cpus, max(0, cpus - taken[name])) for name, cpus in self.cpus.items()}
+        return {name: ClusterNode(name, name, cpus, max(0, cpus - taken[name])) for name, cpus in self.cpus.items()}
 
     def stand(self, machine, slots):
         self.actors.append(Actor(machine, slots))
@@ -157,7 +157,7 @@ def submit(bridge, *numbers):
 def ended(number, files=None):
     result = TrialResult(TrialSpec(number, number, {}, {}, max_steps=3), Outcome.SURVIVED, steps=3, wall_s=0.0)
     line = json.dumps({"ticket": 100 + number, "result": result.to_json()}).encode() + b"\n"
-    return EndedTrial(100 + number, number, line, files or {})
+    return NodeTrial(100 + number, number, line, files or {})
 
 
 def notes(told):
@@ -321,7 +321,7 @@ def test_a_hunt_that_has_had_nodes_waits_for_them_from_the_start(begin):
 def test_an_actor_that_ends_again_and_again_is_not_asked_any_more(begin, monkeypatch):
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     _, cluster, after = begin(a=1)
-    cluster.differing["a"] = Lost("gone")
+    cluster.differing["a"] = NodeLostError("gone")
     with pytest.raises(
         UsageError, match=r"a: its process was ended 3 times .*, as happens with RAY_AUTH_MODE=token here"
     ):
@@ -336,7 +336,7 @@ def test_a_loss_between_trials_that_end_is_no_reason_to_give_a_node_up(begin):
         after()
         cluster.news(cluster.actors[-1], ended(number))
         after()
-        cluster.ready[cluster.actors[-1].asked] = Lost("gone")
+        cluster.ready[cluster.actors[-1].asked] = NodeLostError("gone")
         after()
     assert len(cluster.actors) == 5
     assert not bridge._refused
@@ -350,7 +350,7 @@ def test_the_one_that_ends_every_node_is_distinguished_from_who_was_there(begin)
         told = after()
         results += [message["result"] for message in told if "result" in message]
         if not results:
-            cluster.ready[cluster.actors[-1].asked] = Lost("gone")
+            cluster.ready[cluster.actors[-1].asked] = NodeLostError("gone")
     (culprit,) = results
     assert culprit["spec"]["number"] == 0
     assert "was lost 3 times, at last with this trial alone on it" in json.dumps(culprit)

@@ -18,8 +18,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor, _cluster, _executor, _node_worker
-from crashhunt.executors.ray._cluster import Cluster, Found, Lost, Meant, TokenError, UnreachableError
-from crashhunt.executors.ray._code_archive import Place, Store, _is_same_snapshot
+from crashhunt.executors.ray._cluster import Cluster, ClusterNode, Meant, NodeLostError, TokenError, UnreachableError
+from crashhunt.executors.ray._code_archive import NodeFolder, Store, _is_same_snapshot
 from crashhunt.executors.ray._node_actor import Site
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.scenario import AgentSetup, Scenario
@@ -139,8 +139,8 @@ def test_nodes_are_named_by_their_machines(ray, cluster):
     ]  # fmt: skip
     ray.free = {"aaaaaaaa": {"CPU": 1.5}, "bbbbbbbb": {"CPU": 7.0}, "eeeeeeee": {}}
     assert list(cluster.nodes().values()) == [
-        Found("aaaaaaaa", "one", 4, 1), Found("bbbbbbbb", "two-bbbbbb", 2, 2), Found("cccccccc", "two-cccccc", 2, 0),
-        Found("eeeeeeee", "head", 0, 0),
+        ClusterNode("aaaaaaaa", "one", 4, 1), ClusterNode("bbbbbbbb", "two-bbbbbb", 2, 2),
+        ClusterNode("cccccccc", "two-cccccc", 2, 0), ClusterNode("eeeeeeee", "head", 0, 0),
     ]  # fmt: skip
     ray.nodes = [{}]
     with pytest.raises(UnreachableError, match="at this machine does not answer"):
@@ -181,7 +181,7 @@ def test_calls_and_answers_of_actors(ray, cluster):
         cluster.value(RayTaskError(ValueError("odd")))
     with pytest.raises(RayTaskError):
         cluster.value(RayTaskError("odd"))
-    with pytest.raises(Lost):
+    with pytest.raises(NodeLostError):
         cluster.value(RayError())
     made = []
     assert [cluster.shared(lambda: made.append(True) or b"code") for _ in range(2)] == [b"code"] * 2
@@ -609,7 +609,7 @@ def test_archives_that_were_used_last_are_kept(tmp_path):
     store.drop("d")
     store.drop("d")
     assert store.find("d") is None
-    place = Place()
+    place = NodeFolder()
     assert place.scratch.is_dir()
     assert not place.unpack(b"damaged", "digest")
     assert not place.code.exists()

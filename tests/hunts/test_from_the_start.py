@@ -20,7 +20,7 @@ from crashhunt.hunts._fork_results import (
     verify_rare,
 )
 from crashhunt.hunts._progress import PhaseClock, Progress
-from crashhunt.hunts._verification import Found, VerificationRuns, keep_near_misses
+from crashhunt.hunts._verification import ForkCrash, VerificationRuns, keep_near_misses
 from crashhunt.trial import (
     KILLED,
     Branch,
@@ -36,7 +36,7 @@ from crashhunt.trial import (
     TrialSpec,
 )
 
-FOUND = Found(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
+FOUND = ForkCrash(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
 
 
 def runs(tmp_path, stops, run):

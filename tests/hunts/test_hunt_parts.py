@@ -31,7 +31,7 @@ from crashhunt.hunts._hunt import Hunt, RunningHunt, TrialLoop
 from crashhunt.hunts._next_trials import result_lag
 from crashhunt.hunts._progress import PhaseClock, Progress
 from crashhunt.hunts._reports import BranchReport, Difference, ProbeReport, RareReport, kind_data
-from crashhunt.hunts._verification import Again, Confirmation, Judged, TrialReruns, is_settled
+from crashhunt.hunts._verification import Confirmation, Judged, RepeatedTrial, TrialReruns, is_settled
 from crashhunt.ledger import Ledger
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, RunSettings, read_settings
 from crashhunt.results import _hunt_results as _results, _log_reader
@@ -715,7 +715,8 @@ def test_trials_run_again_with_the_code_that_they_ran_with(tmp_path, monkeypatch
     found = list(again.run(specs, "near"))
     scratch = tmp_path / "scratch/near"
     assert found == [
-        Again(ended=ran(place, number), runs=again, snapshot="0f", folder="near") for place, number in enumerate((1, 2))
+        RepeatedTrial(ended=ran(place, number), runs=again, snapshot="0f", folder="near")
+        for place, number in enumerate((1, 2))
     ]
     assert made == [(((SETTINGS, tmp_path / layout.SNAPSHOTS / "0f", scratch), "snapshot"), 2)]
     assert (removed, Runs.closed) == ([scratch], 1)

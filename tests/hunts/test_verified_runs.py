@@ -17,7 +17,7 @@ from crashhunt.executors import NodeFigures
 from crashhunt.hunts import _audits, _progress, _verification
 from crashhunt.hunts._audits import Audit, PendingAudits, _finish
 from crashhunt.hunts._progress import PhaseClock, Progress, RemainingTime, StrategyTally
-from crashhunt.hunts._verification import Found, Judged, TrialReruns, VerificationRuns
+from crashhunt.hunts._verification import ForkCrash, Judged, TrialReruns, VerificationRuns
 from crashhunt.plans import RunSettings
 from crashhunt.recording import Divergence
 from crashhunt.scenario import AgentSetup, Scenario
@@ -121,7 +121,7 @@ def again(tmp_path):
 
 
 def found(number, outcome="collision", step=5):
-    return Found(spec(number), outcome, step)
+    return ForkCrash(spec(number), outcome, step)
 
 
 def crash(number, **more):

@@ -28,7 +28,7 @@ from crashhunt.simulators import MotionState
 from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._followers import Followers, Piece, _Part
 from crashhunt.sumo.maps._road_network import NetworkLane
-from crashhunt.trial import Signature
+from crashhunt.trial import CallSignature
 
 EMPTY = {"intersection": {"priority_demand": 1, "minor_demand": 1}, "motorway": {"demand": 1}}
 SEEN = pytest.mark.parametrize("visible", ["front", "whole"])
@@ -332,7 +332,7 @@ def test_new_hunts_choose_the_outline_for_forms_that_can_be_in_two_lanes():
     ],
 )
 def test_hunt_records_what_others_see_and_an_environment_has_the_same(form, recorded):
-    signatures = {"ego": Signature({}, open=True, given=())}
+    signatures = {"ego": CallSignature({}, open=True, given=())}
     assert chosen_actions(form, load_scenario("intersection"), signatures).get("ego") == recorded
     episodes = Episodes("intersection", "ego", form)
     assert episodes._simulator._followers.agents == (["ego"] if "whole" in str(recorded) else [])

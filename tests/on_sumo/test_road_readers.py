@@ -19,7 +19,7 @@ from crashhunt.simulators import parse_parts  # noqa: E402
 from crashhunt.sumo import _right_of_way_readers, _road_readers as readers, _signal_readers  # noqa: E402
 from crashhunt.sumo._conflicts import Conflicts  # noqa: E402
 from crashhunt.sumo._lane_graph import LaneGraph  # noqa: E402
-from crashhunt.sumo._reader_protocol import Moment, Places, ReaderSetup  # noqa: E402
+from crashhunt.sumo._reader_protocol import AgentMoment, Places, ReaderSetup  # noqa: E402
 from crashhunt.sumo.maps import read_network  # noqa: E402
 
 NETS = Path(__file__).parent / "nets"
@@ -50,7 +50,7 @@ READERS = {
 
 def moment_of(vehicle):
     """The scene of a vehicle alone, as seen by itself."""
-    return Moment(
+    return AgentMoment(
         scene=SimpleNamespace(
             points=[libsumo.vehicle.getPosition(vehicle)],
             headings=[math.radians(90 - libsumo.vehicle.getAngle(vehicle))],

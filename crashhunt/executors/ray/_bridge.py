@@ -25,7 +25,7 @@ from crashhunt.base.errors import CrashhuntError, RecorderError, UsageError
 from crashhunt.base.exceptions import in_words
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._postmortem import killed_from_outside
-from crashhunt.executors.ray._cluster import Cluster, Found, Lost, TokenError, UnreachableError
+from crashhunt.executors.ray._cluster import Cluster, ClusterNode, NodeLostError, TokenError, UnreachableError
 from crashhunt.executors.ray._code_archive import CodeArchive
 from crashhunt.executors.ray._node_scheduler import Node, NodeScheduler, Trial, shares
 from crashhunt.executors.ray._node_worker import unpacked
@@ -34,10 +34,10 @@ from crashhunt.trial import TrialSpec
 if TYPE_CHECKING:
     from crashhunt.executors.ray._messages import (
         BridgeJob,
-        EndedTrial,
         FromBridge,
         News,
         NodeJob,
+        NodeTrial,
         ToBridge,
     )
 
@@ -227,7 +227,7 @@ class Bridge:
             self._alone = True
             self._send(note="no node of the cluster is left; the hunt waits until one is back", capacity=0)
 
-    def _room(self, found: Found) -> int:
+    def _room(self, found: ClusterNode) -> int:
         """Return the number of further trials that a machine can run."""
         parts = self._scheduler.parts(found.id)
         if not parts:
@@ -236,7 +236,7 @@ class Bridge:
         self._free[found.id] = self._free.get(found.id, 0) + 1 if settled else 0
         return found.free if self._free[found.id] >= _FREE_CPU_READINGS else 0
 
-    def _is_too_late(self, node: Node, found: Found) -> bool:
+    def _is_too_late(self, node: Node, found: ClusterNode) -> bool:
         """Return whether an actor has waited too long for its CPUs, for example because another hunt uses them."""
         waited_s = time.monotonic() - node.stood
         if node.doing != "differs" or waited_s < _LOOK_EVERY_S or not self._cluster.waits(node.actor):
@@ -259,7 +259,7 @@ class Bridge:
         answer, node.answer = node.answer, None
         try:
             said = self._cluster.value(answer)
-        except Lost:
+        except NodeLostError:
             self._drop_node(node)
             return
         except Exception as error:  # of ours, over there
@@ -308,7 +308,7 @@ class Bridge:
             error = CrashhuntError.from_json(news.error)
             self._refuse(node, f"{error.where}: {error.message}" if error.where else error.message)
 
-    def _keep(self, node: Node, ended: EndedTrial) -> None:
+    def _keep(self, node: Node, ended: NodeTrial) -> None:
         """Write the files of a kept trial to the folder in which the hunt expects them.
 
         Raises:

@@ -200,7 +200,7 @@ _CONCURRENCY_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWE
 _CONCURRENCY_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 
-class Lost(Exception):  # noqa: N818 - it is no fault
+class NodeLostError(Exception):
     """The node was lost, or the actor on it was lost."""
 
 
@@ -227,7 +227,7 @@ class TokenError(UnreachableError):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ClusterNode:
     """A node of a Ray cluster."""
 
     id: str
@@ -279,7 +279,7 @@ class Cluster:
         self._kind: Any = kind(_node_actor.Site)
         self._shared: Any = None
 
-    def nodes(self) -> dict[str, Found]:
+    def nodes(self) -> dict[str, ClusterNode]:
         """Return the present nodes of the cluster.
 
         Raises:
@@ -298,7 +298,9 @@ class Cluster:
             name, host = node["NodeID"], node["NodeManagerHostname"]
             shown = host if hosts[host] == 1 else f"{host}-{name[:6]}"
             cpus = int(node["Resources"].get("CPU", 0))
-            found[name] = Found(id=name, name=shown, cpus=cpus, free=min(cpus, int(free.get(name, {}).get("CPU", 0))))
+            found[name] = ClusterNode(
+                id=name, name=shown, cpus=cpus, free=min(cpus, int(free.get(name, {}).get("CPU", 0)))
+            )
         return found
 
     def stand(self, node: str, slots: int) -> Any:
@@ -356,7 +358,7 @@ class Cluster:
         except exceptions.RayTaskError as error:
             raise error.cause if isinstance(error.cause, Exception) else error from None
         except exceptions.RayError as error:
-            raise Lost(str(error)) from None
+            raise NodeLostError(str(error)) from None
 
     def shared(self, make: Callable[[], bytes]) -> Any:
         """Return an object that can be sent to all nodes; ``make`` creates it at the first use."""

@@ -277,7 +277,7 @@ class Store:
                     file.unlink()
 
 
-class Place(TemporaryFolder):
+class NodeFolder(TemporaryFolder):
     """The folder of one hunt on a node.
 
     Raises:

@@ -71,7 +71,7 @@ class FromBridge(TypedDict, total=False):
     where: dict[int, Header]
 
 
-class EndedTrial(NamedTuple):
+class NodeTrial(NamedTuple):
     """A trial that has ended on a node.
 
     Attributes:
@@ -98,7 +98,7 @@ class News(NamedTuple):
         map: compressed map of all trials, sent with the first kept trial.
     """
 
-    ended: list[EndedTrial]
+    ended: list[NodeTrial]
     where: dict[int, Header] | None
     notes: list[str]
     error: ErrorData | None

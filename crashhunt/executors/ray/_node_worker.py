@@ -16,8 +16,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._pool import PoolExecutor
-from crashhunt.executors.ray._code_archive import Place, Store, settings_in
-from crashhunt.executors.ray._messages import EndedTrial, Header, News, NodeJob, Submitted
+from crashhunt.executors.ray._code_archive import NodeFolder, Store, settings_in
+from crashhunt.executors.ray._messages import Header, News, NodeJob, NodeTrial, Submitted
 from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
 
@@ -41,7 +41,7 @@ class Work:
     def __init__(self, job: NodeJob) -> None:
         self._job = job
         self._store = Store()
-        self._place: Place | None = None
+        self._place: NodeFolder | None = None
         self._pool: PoolExecutor | None = None
         self._lock = threading.Lock()
         self._tickets: dict[int, int] = {}
@@ -70,7 +70,7 @@ class Work:
         return "ready"
 
     def _ready(self, packed: bytes) -> bool:
-        self._place = self._place or Place()
+        self._place = self._place or NodeFolder()
         if not self._place.unpack(packed, self._job["digest"]):
             return False
         settings = WorkerSettings.from_json(self._job["settings"])
@@ -111,7 +111,7 @@ class Work:
         """Queue trials, and return the events; wait at most ``wait_s`` for a trial to end."""
         assert self._pool is not None
         self.submit(trials)
-        ended: list[EndedTrial] = []
+        ended: list[NodeTrial] = []
         error: ErrorData | None = None
         try:
             if self._broken is not None:
@@ -158,7 +158,7 @@ class Work:
         if self._place is not None:
             self._place.remove()
 
-    def _queue_trials(self, ticket: int, result: TrialResult) -> EndedTrial:
+    def _queue_trials(self, ticket: int, result: TrialResult) -> NodeTrial:
         data = result.to_json()
         if data.get("failure"):
             data["failure"] = self._with_hunt_paths(data["failure"])
@@ -171,7 +171,7 @@ class Work:
                 if path.is_file() and not path.is_symlink():
                     files[path.name] = zlib.compress(self._content(path), 1)
             shutil.rmtree(folder, ignore_errors=True)  # whatever else an agent has put there
-        return EndedTrial(ticket=ticket, number=result.spec.number, line=line, files=files)
+        return NodeTrial(ticket=ticket, number=result.spec.number, line=line, files=files)
 
     def _content(self, path: Path) -> bytes:
         with path.open("rb") as file:
