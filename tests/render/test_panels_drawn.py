@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("PIL")
 
-from crashhunt.panels import Action, ActionDistribution, Bar, Contour, Curve, Curve3D, Heatmap, Picture
+from crashhunt.panels import ActionDistribution, Contour, Curve, Heatmap, Picture
 from crashhunt.panels._panels import COLORS, color_map, map_colors, number, ticks
 
 BLUE = (0, 114, 178)
@@ -32,55 +32,6 @@ def test_curves_have_the_colours_that_colour_blind_people_can_tell_apart():
     picture = Curve({str(place): [place, place] for place in range(6)}).draw(300, 200)
     found = [np.nonzero(where(picture, color)[:, 20:150])[0].mean() for color in COLORS[:6]]
     assert found == sorted(found, reverse=True)  # the higher a value, the smaller its row
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize("width", [240, 400])
-def test_each_bar_is_in_the_middle_of_its_room_with_its_number_above(count, width):
-    values = [1.0 + place for place in range(count)]
-    picture = Bar(values).draw(width, 160)
-    room = (width - 16) / count
-    bars = runs(where(picture, BLUE).any(axis=0))
-    assert len(bars) == count
-    for place, (left, right) in enumerate(bars):
-        assert (left + right) / 2 == pytest.approx(8 + (place + 0.5) * room, abs=1.5)
-        assert right - left == pytest.approx(0.7 * room, abs=2)
-        rows = np.nonzero(where(picture, BLUE)[:, (left + right) // 2])[0]
-        assert rows.max() == pytest.approx(np.nonzero(where(picture, BLUE))[0].max(), abs=1)  # they stand on zero
-        room_of_it = picture[rows.min() - 14 : rows.min(), round(8 + place * room) + 1 : round(8 + (place + 1) * room)]
-        ink = np.nonzero((room_of_it < 128).all(axis=2))
-        assert len(ink[0])
-        assert ink[1].mean() == pytest.approx(room / 2, abs=4)
-
-
-def test_names_are_below_their_bars_and_names_of_curves_above_the_axes_in_their_colours():
-    plain, named = (Bar({name: 1.0}).draw() for name in ("", "name"))
-    rows, columns = np.nonzero((plain != named).any(axis=2))
-    bar = np.nonzero(where(named, BLUE))[0].max()
-    assert bar < rows.min() <= bar + 8
-    assert columns.mean() == pytest.approx(120, abs=2)
-    names, mine = {"speed": [0, 0], "limit": [1, 1]}, {"limit": (143, 15, 63)}
-    legend = Curve(names, low=-9, high=9, colors=mine).draw()
-    lines = Curve({f"{name} {'x' * 40}": values for name, values in names.items()}, low=-9, high=9).draw()
-    axes = min(np.nonzero((legend == (93, 107, 125)).all(axis=2).sum(axis=1) > 150)[0])
-    lefts = []
-    for color in (COLORS[0], mine["limit"]):
-        rows, columns = np.nonzero((np.abs(legend[:axes].astype(int) - color) < 60).all(axis=2))
-        assert rows.max() < axes
-        lefts.append(columns.min())
-    assert 38 <= lefts[0] < lefts[1] - 20
-    assert min(np.nonzero((lines == (93, 107, 125)).all(axis=2).sum(axis=1) > 150)[0]) == axes + 13  # a row for each
-    nothing = Heatmap([[np.nan, np.nan]]).draw()
-    unit = Heatmap([[np.nan, np.nan]], low=0.0, high=1.0).draw()
-    assert np.array_equal(nothing, unit)  # without values, the scale is from 0 to 1
-
-
-def test_limits_of_bars_cut_them_and_numbers_that_are_none_have_no_bar():
-    picture = Bar({"a": 5.0, "b": math.nan, "c": 2.0}, low=0.0, high=4.0).draw()
-    heights = where(picture, BLUE).sum(axis=0)
-    a, b, c = (int(heights[8 + round((place + 0.5) * 224 / 3)]) for place in range(3))
-    assert b == 0
-    assert a == pytest.approx(2 * c, abs=2)
 
 
 def test_a_distribution_over_actions_is_up_to_one_and_a_normal_one_has_its_peak_at_the_mean():
@@ -170,18 +121,6 @@ def test_a_contour_changes_colour_where_a_level_ends():
             assert row[edge - 3 : edge + 4].sum(axis=1).min() < 0.8 * row[at].sum()  # a darker line
 
 
-def test_parts_of_an_action_have_a_line_each_from_zero_to_the_value():
-    picture = Action([0.5, -0.5, 0.0], low=[-1.0] * 3, high=[1.0] * 3, names=["a", "b", "c"]).draw()
-    lines = runs(where(picture, BLUE).any(axis=1))
-    assert len(lines) == 3
-    spans = [runs(where(picture, BLUE)[first : last + 1].any(axis=0))[0] for first, last in lines]
-    middle, quarter = (8 + 231) / 2, 223 / 4
-    assert spans[0] == pytest.approx((middle, middle + quarter), abs=1)
-    assert spans[1] == pytest.approx((middle - quarter, middle), abs=1)
-    assert spans[2][1] - spans[2][0] <= 1
-    assert lines[1][0] - lines[0][0] == lines[2][0] - lines[1][0] == 34
-
-
 def test_a_picture_keeps_its_shape_and_is_in_the_middle():
     for shape in ((10, 40), (40, 10)):
         drawn = Picture(np.full((*shape, 3), (200, 30, 30), np.uint8)).draw(240, 160)
@@ -192,21 +131,3 @@ def test_a_picture_keeps_its_shape_and_is_in_the_middle():
         assert width <= 228
     grey = Picture(np.array([[0.0, 1.0]])).draw()
     assert {tuple(grey[90, 30]), tuple(grey[90, 210])} == {(0, 0, 0), (255, 255, 255)}
-
-
-def test_a_curve_in_space_is_seen_from_its_azimuth_and_goes_up_with_z():
-    line = np.stack([np.linspace(0, 1, 40)] * 3, axis=1)
-
-    def ends(points, azimuth):
-        picture = Curve3D(points, azimuth=azimuth).draw()
-        dark, light = (np.nonzero(np.abs(picture.astype(int) - shade).max(axis=2) < 25) for shade in
-                       (color_map()[0].astype(int), color_map()[-1].astype(int)))  # fmt: skip
-        return (dark[1].mean(), dark[0].mean()), (light[1].mean(), light[0].mean())
-
-    first, last = ends(line * [0, 0, 1], 0.0)
-    assert last[1] < first[1] - 40
-    assert last[0] == pytest.approx(first[0], abs=3)
-    first, last = ends(line * [1, 0, 0], 0.0)
-    assert last[0] > first[0] + 60
-    turned = ends(line * [1, 0, 0], 180.0)
-    assert turned[1][0] < turned[0][0] - 60

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -56,36 +55,6 @@ def box(picture, color, tolerance=0):
     return (low + high + 1) / 2, high - low + 1
 
 
-@pytest.mark.parametrize("heading", [0.0, math.pi / 2, math.pi])
-def test_the_agent_is_in_the_middle_and_its_windscreen_in_its_front_half(heading):
-    picture = view(recording({"ego": (70.0, -9.0, heading, 5.0)}, actors=[CAR])).draw(0)
-    at, size = box(picture, EGO)
-    assert at == pytest.approx(MIDDLE, abs=1)
-    along, across = (0, 1) if abs(math.cos(heading)) > 0.5 else (1, 0)
-    assert size[along] == pytest.approx(5.0 * SCALE, abs=2)
-    assert size[across] == pytest.approx(2.0 * SCALE, abs=2)
-    ahead = np.array([math.cos(heading), -math.sin(heading)])  # rows grow downwards
-    dark = np.abs(picture.astype(int) - [part // 2 for part in EGO]).max(axis=2) == 0
-    rows, columns = np.nonzero(dark)
-    offset = np.stack((columns, rows), axis=1) + 0.5 - MIDDLE
-    forward, sideways = offset @ ahead, np.abs(offset @ [-ahead[1], ahead[0]])
-    inside = (np.abs(forward) < 2.3 * SCALE) & (sideways < 0.95 * SCALE)
-    place = offset[inside].mean(axis=0)
-    assert sideways.max() <= 1.0 * SCALE + 1  # it does not reach out of the vehicle
-    assert place @ ahead == pytest.approx((2.5 - 0.28 * 5.0) * SCALE, abs=1.5)
-    assert abs(place @ ahead[::-1]) < 1.5
-
-
-def test_others_are_where_they_are_relative_to_the_agent_north_up():
-    places = {"ego": (2.5, 0.0, 0.0, 5.0), "other": (16.0, 8.0, 0.0, 5.0), "b": (-9.5, -6.0, 0.0, 5.0)}
-    found = recording(places, actors=[CAR, TRUCK, Actor("b", "passenger", 5.0, 2.0)], agents=("ego", "b"))
-    picture = view(found, other="other").draw(0)
-    for color, middle, size in ((PARTNER, (10.0, 8.0), (12.0, 2.5)), (AGENT, (-12.0, -6.0), (5.0, 2.0))):
-        at, extent = box(picture, color)
-        assert (at - MIDDLE) / SCALE == pytest.approx((middle[0], -middle[1]), abs=0.2)
-        assert extent / SCALE == pytest.approx(size, abs=0.3)
-
-
 @pytest.mark.parametrize(("scale", "radius"), [(8.0, 4.0), (40.0, 10.0)])
 def test_a_person_is_a_disc_that_can_be_seen(scale, radius):
     person = Actor(f"{PERSON}a", "pedestrian", 0.5, 0.5)
@@ -96,33 +65,12 @@ def test_a_person_is_a_disc_that_can_be_seen(scale, radius):
     assert size == pytest.approx([2 * radius] * 2, abs=1.5)
 
 
-def test_the_trail_shows_where_the_agent_was_in_the_last_4_seconds():
-    steps = [{"ego": (0.5 * number, 0.0, 0.0, 5.0)} for number in range(101)]
-    picture = view(recording(*steps, actors=[CAR])).draw(100)
-    pale = tuple((part + 255) // 2 for part in EGO)
-    at, size = box(picture, pale)
-    left = at[0] - size[0] / 2
-    assert (MIDDLE[0] - left) / SCALE == pytest.approx(20.0 - 2.5, abs=0.4)  # 4 s at 5 m/s, from the front
-
-
 @pytest.mark.parametrize(("scale", "meters"), [(8.0, 10), (2.0, 50), (20.0, 5), (0.5, 200)])
 def test_the_scale_is_a_line_of_a_round_length(scale, meters):
     found = recording({"ego": (0.0, 0.0, 0.0, 0.0)}, actors=[CAR])
     picture = view(found, scale=scale, width=640, height=360).draw(0)
     row = (np.abs(picture[360 - 12].astype(int) - (93, 107, 125)).max(axis=1) < 3).nonzero()[0]
     assert (row.min(), row.max()) == (14, pytest.approx(14 + meters * scale, abs=1))
-
-
-def test_lanes_in_sight_are_drawn_between_their_borders():
-    x = np.linspace(-100, 100, 20)
-    lane = (np.stack((x, np.full(20, -5.0)), 1), np.stack((x, np.full(20, -2.0)), 1))
-    far = (lane[0] + [0, 500], lane[1] + [0, 500])
-    found = recording({"ego": (2.5, 0.0, 0.0, 0.0)}, actors=[CAR])
-    picture = view(found, scale=8.0).draw(0)
-    with_lanes = SceneView(found, [lane, far], agent="ego", width=WIDTH, height=HEIGHT, scale=8.0).draw(0)
-    column = (with_lanes[:, 300] != picture[:, 300]).any(axis=1).nonzero()[0]
-    assert (column.min(), column.max()) == (pytest.approx(150 + 16, abs=1), pytest.approx(150 + 40, abs=1))
-    assert tuple(with_lanes[150 + 28, 300]) == (228, 232, 237)
 
 
 def test_obstacles_in_sight_are_drawn_as_areas():
@@ -300,14 +248,6 @@ def test_far_gaps_are_cut_so_that_near_ones_can_be_read():
     shot = Shot(recording(*places, actors=[CAR, TRUCK]), [], "ego", "other", -1, {})
     curves = [panel for _, panel in builtin_panels(shot).panels(3) if isinstance(panel, Curve)]
     assert (curves[1].low, curves[1].high) == (0.0, 100.0)
-
-
-def test_cut_values_are_a_dotted_line_at_the_axis():
-    inside, cut = (Curve(np.full(50, value), low=0.0, high=10.0).draw() for value in (9.0, 12.0))
-    blue = [(picture == (0, 114, 178)).all(axis=2) for picture in (inside, cut)]
-    assert blue[0].sum(axis=1).max() > 180  # a line over the whole width
-    assert 80 < blue[1].sum(axis=1).max() < 140  # gaps between its dots
-    assert np.flatnonzero(blue[1].any(axis=1)).max() < np.flatnonzero(blue[0].any(axis=1)).min()
 
 
 def test_a_film_shows_the_last_seconds_or_those_around_a_near_miss():
