@@ -153,6 +153,8 @@ class HighwaySimulator:
         self._watch()
         self._events = HighwayEvents(self.step_length_s, self._scenario.events, lanes_are_road=self._lanes_are_road)
         self._read_scene(())
+        if self._kinematics is not None:
+            self._kinematics.hidden.clear()
         self._parts.begin(self._begins_s, self.step_length_s, seed)
         return self._show(self.agents, shown), {}
 

@@ -297,30 +297,26 @@ class SimulatorContract:
             return
         assert all(isinstance(kind, str) for kind in simulator.disturbing_kinds)
         before = self._drive(simulator, 1)
-        simulator.reset(seed=1)
-        agents = tuple(simulator.agents)
-        for agent in agents:
-            simulator.actions[agent].space.seed(3)
-        held = {name: simulator.actions[name].encode(simulator.actions[name].space.sample()) for name in agents}
-        erring = {}
-        for number, kind in enumerate(simulator.disturbing_kinds):
+        for kind in simulator.disturbing_kinds:
+            simulator.reset(seed=1)
+            agents = tuple(simulator.agents)
+            for agent in agents:
+                simulator.actions[agent].space.seed(3)
+            held = {name: simulator.actions[name].encode(simulator.actions[name].space.sample()) for name in agents}
+            erring = {}
             for cell in CELLS:
-                planned = Disturbance(
-                    step=number + 1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0]
-                )
+                planned = Disturbance(step=1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0])
                 vehicle = simulator.resolve_target(planned)
                 assert vehicle == "" or vehicle in simulator.scene().roster.index
                 assert vehicle not in agents
                 if vehicle and vehicle not in erring:
                     erring[vehicle] = simulator.disturb(vehicle, planned)
-            if simulator.agents:
-                simulator.step({name: held[name] for name in simulator.agents})
-            for errs in erring.values():
-                if errs is not None:
-                    assert np.isfinite(errs.how_strong)
-                    errs.keep()
-        for errs in list(erring.values())[::2]:  # the others continue to the end
-            if errs is not None:
+            simulator.step(held)
+            active = [errs for errs in erring.values() if errs is not None]
+            for errs in active:
+                assert np.isfinite(errs.how_strong)
+                errs.keep()
+            for errs in active[1::2]:  # the others continue to the end
                 errs.end()
         assert self._drive(simulator, 1) == before
         simulator.close()
