@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 from crashhunt.base import layout
 from crashhunt.base.agent_locators import is_program
-from crashhunt.base.errors import FULL, CrashhuntError, UsageError
+from crashhunt.base.errors import FULL, CrashhuntError, HuntDirectoryError, UsageError
 from crashhunt.base.files import cannot_write
 from crashhunt.base.integrity import MAX_INTEGER
 from crashhunt.base.older_versions import removed_fix
@@ -219,9 +219,26 @@ def opened_hunt(directory: Path) -> Iterator[tuple[Path, bool]]:
         return
     from crashhunt.plans import read_settings
 
-    hunt = directory.resolve().parent.parent if (directory / layout.CRASH).is_file() else directory
+    hunt = hunt_of_bundle(directory) if (directory / layout.CRASH).is_file() else directory
     read_settings(hunt / layout.HUNT)  # refuses what is no hunt
     yield hunt, False
+
+
+def hunt_of_bundle(bundle: Path) -> Path:
+    """Return the directory of the hunt that contains a bundle.
+
+    Raises:
+        HuntDirectoryError: the bundle is not inside a hunt.
+    """
+    from crashhunt.results import is_hunt
+
+    hunt = bundle.resolve().parent.parent
+    if not is_hunt(hunt):
+        raise HuntDirectoryError(
+            f"{str(bundle)!r} is a crash outside the directory of its hunt",
+            fix="give the directory of the hunt, or a file that crashhunt export wrote",
+        )
+    return hunt
 
 
 def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import DONE, Commands, CrashId, Options, add_json, integer, opened_hunt, say
+from crashhunt.cli._common import DONE, Commands, CrashId, Options, add_json, hunt_of_bundle, integer, opened_hunt, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,7 +133,7 @@ def _subject(options: Options) -> tuple[Path, str]:
         )
     if options.crash or (directory / layout.CRASH).is_file():
         bundle = find_bundle(directory, options.crash)
-        hunt = directory if options.crash else directory.absolute().parent.parent
+        hunt = directory if options.crash else hunt_of_bundle(directory)
         return hunt, subject_of(bundle)
     hunts = find_hunts(directory)
     if hunts != [directory]:

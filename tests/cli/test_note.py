@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from conftest import one_in
@@ -51,6 +52,14 @@ def test_notes_are_added_found_shown_and_removed(hunt):
     assert hunt.crashhunt("check", "out", "--json").json["fine"]
     assert hunt.crashhunt("note", "out", "--remove", "1", "--json").json["removed"][0]["text"] == "nightly run"
     assert "nightly run" not in hunt.crashhunt("status", "out").out
+
+
+def test_crash_outside_its_hunt_has_no_report_and_no_notes(hunt):
+    shutil.copytree(list_bundles(hunt.folder / "out")[0].path, hunt.folder / "sent" / "copy" / "crash")
+    for words in (("report", "sent/copy/crash"), ("note", "sent/copy/crash", "mine"), ("note", "sent/copy/crash")):
+        refused = hunt.crashhunt(*words, expect=2)
+        assert refused.err.startswith("crashhunt: 'sent/copy/crash' is a crash outside the directory of its hunt; give")
+    assert not list((hunt.folder / "sent").glob("*.*"))
 
 
 def test_salvaged_hunt_keeps_its_notes_and_a_new_hunt_has_none(hunt):
