@@ -168,7 +168,7 @@ _TESTS_ELSEWHERE = {
     "results/_trial_table.py": ("hunts/test_hunt_parts.py", "results/test_results.py"),
     "results/_hunt_results.py": ("results/test_*.py", "e2e/test_manage.py"),
     "results/_hunt_state.py": ("results/test_directory.py", "hunts/test_hunt_parts.py"),
-    "hunts/_audits.py": ("hunts/test_states_and_reports.py", "hunts/test_verified_runs.py", "e2e/test_audit.py"),
+    "hunts/_audits.py": ("hunts/test_states_and_reports.py", "hunts/test_verified_runs.py"),
     "hunts/_verification.py": ("hunts/test_whole_hunts.py", "hunts/test_from_the_start.py"),
     "oracles/_requirement_oracle.py": (
         "episode/test_trial_signals.py",

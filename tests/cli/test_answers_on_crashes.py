@@ -479,7 +479,7 @@ def test_whatif_asks_for_the_change_that_is_named(opened, monkeypatch, capsys, s
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["whatif", "h", "--times", "-1"], "--times is -1; give at least 1"),
+        (["whatif", "h", "--times", "0"], "--times is 0; give at least 1"),
         (
             ["whatif", "h", "--times", str(2**63)],
             f"argument --times: '{2**63}' is out of range (allowed: up to {2**63 - 1})",

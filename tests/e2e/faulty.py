@@ -67,17 +67,6 @@ class Nan(Fine):
         return math.nan, 0
 
 
-class Wanders(Raises):
-    """Goes elsewhere, and needs a file of where it was."""
-
-    def __init__(self, speed: float = 8.0):
-        super().__init__(speed=float(Path("needed.txt").read_text()))
-
-    def act(self, observation):
-        os.chdir("/")
-        return super().act(observation)
-
-
 class OutOfSpace(Fine):
     def go_wrong(self):
         return 10.0, 2

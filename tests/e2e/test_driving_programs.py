@@ -16,7 +16,6 @@ from compiled_libraries import compile_library
 from json_schemas import validator
 from pages import Page
 from programs import COMPILER, COMPILER_CXX, DRIVER, compile_program, write_binary_program, write_program
-from repositories import git, make_repository
 
 RUN = ("--scenario", "toy", "--seed", "3")
 NEAR = ("--set", "gap_m=12")  # where a crash comes soon
@@ -139,26 +138,6 @@ def test_libraries_that_are_not_the_systems_travel_with_a_program(toy):
     assert [line.rpartition("/")[2] for line in current["code_differences"]] == ["libchoice.so has changed"]
     shutil.rmtree(source)
     assert toy.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
-
-
-@pytest.mark.nightly
-def test_bisect_builds_the_program_of_each_revision(toy):
-    project = toy.folder / "project"
-    project.mkdir()
-    planner = write_program(project, "planner.in")
-    text = planner.read_text()
-    (project / ".gitignore").write_text("planner\n")
-    make_repository(project)
-    for number, code in enumerate((text + "\n# 1\n", text)):
-        planner.write_text(code.replace('kind == "blind"', "True") if number else code)
-        git(project, "commit", "-qam", f"change {number}")
-    planner.write_text(planner.read_text() + "\n# 2\n")
-    git(project, "commit", "-qam", "change 2")
-    shutil.copy(planner, project / "planner")
-    toy.folder = project
-    toy.crashhunt("run", "../h", "1", "9", "200", "--scenario", "../toy", "--agent", "exec:./planner", "--seed", "3")
-    found = toy.crashhunt("bisect", "../h", "--good", "HEAD~3", "--build", "cp planner.in planner", "--json").json
-    assert found["subject"] == "change 1"
 
 
 def same_driver(shell, trials, scenario, *words, max_steps=200):

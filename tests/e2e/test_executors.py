@@ -7,9 +7,6 @@ import tomllib
 
 import pytest
 
-import crashhunt
-from crashhunt.base.errors import PluginError, UsageError
-
 MINE = '''
 from pathlib import Path
 from crashhunt.executors import PoolExecutor
@@ -112,29 +109,6 @@ def test_an_executor_of_somebodys_own_runs_the_trials(mine):
         for hunt in "hg"
     ]
     assert digests[0] == digests[1]
-
-
-@pytest.mark.nightly
-def test_suites_rerun_and_python_choose_it_too(mine, monkeypatch):
-    entry = 'id = "a"\nscenario = "toy"\ntrials = 2\nmax_steps = 20\nseed = 1\narguments.speed = 5\n'
-    (mine.folder / "s.toml").write_text(f"[[hunts]]\n{entry}")
-    (mine.folder / "own.toml").write_text(f'[[hunts]]\n{entry}executor = "mine:Logged:own"\n')
-    mine.crashhunt("suite", "run", "s.toml", "s", "1", "--executor", "mine:Logged:all")
-    assert calls(mine)[0] == "made 1 all"
-    mine.crashhunt("suite", "run", "own.toml", "own", "1")
-    assert calls(mine)[0] == "made 1 own"
-    mine.crashhunt("rerun", "own", "--all", "--parallel", "1")
-    assert calls(mine)[0] == "made 1 own"
-    mine.crashhunt("rerun", "own/a/0", "--to", "again", "--parallel", "1", "--executor", "mine:Logged:else")
-    assert calls(mine)[0] == "made 1 else"
-    monkeypatch.chdir(mine.folder)
-    report = crashhunt.run("p", 1, 1, 20, scenario="toy", arguments={"speed": 5}, executor="mine:Logged", seed=1)
-    assert report.stopped_because == "all_trials"
-    assert calls(mine)[1] == "submit 0"
-    with pytest.raises(PluginError, match="'nope' is not a registered name of executors; give one of"):
-        crashhunt.Suite.read("s.toml").run("t", machine={"executor": "nope"})
-    with pytest.raises(UsageError, match="--executor is 3; give a text"):
-        crashhunt.prepare("q", 1, 1, 1, scenario="toy", executor=3)
 
 
 @pytest.mark.parametrize(

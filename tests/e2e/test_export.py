@@ -130,22 +130,6 @@ def test_a_strangers_recorded_actions_do_nothing_but_simulate(shell, made_once):
         assert "not made on this machine" in refused.err
 
 
-PLANNER = """
-import pathlib, subprocess
-
-class Agent:
-    def __init__(self):
-        self.program = pathlib.Path(__file__).parent / "build" / "planner"
-
-    def reset(self, seed): self.step = 0
-
-    def act(self, observation):
-        self.step += 1
-        assert self.step < 5
-        return float(subprocess.run([self.program], capture_output=True, check=True).stdout), 0
-"""
-
-
 def test_file_that_a_module_reads_when_it_is_imported_is_named_once(toy):
     (toy.folder / "weights.npz").write_text("6")
     (toy.folder / "planner.py").write_text(f"LIMIT = float(open('weights.npz').read())\n{AGENT}")
@@ -153,25 +137,3 @@ def test_file_that_a_module_reads_when_it_is_imported_is_named_once(toy):
     make_repository(toy.folder)
     done = toy.crashhunt("run", "h", "2", "2", "9", "--scenario", "toy", "--agent", "planner:Agent")
     assert done.out.count("weights.npz is ignored by git, so the snapshot lacks it") == 1
-
-
-@pytest.mark.nightly
-def test_program_that_git_ignores_travels_if_the_user_adds_it(toy):
-    (toy.folder / "planner.py").write_text(PLANNER)
-    (toy.folder / "build").mkdir()
-    program = toy.folder / "build" / "planner"
-    program.write_text("#!/bin/sh\necho 6\n")
-    program.chmod(0o755)
-    (toy.folder / ".gitignore").write_text("build/\nh/\n")
-    make_repository(toy.folder)
-    toy.environment["XDG_STATE_HOME"] = str(toy.folder / "state")
-    words = ("run", "h", "1", "1", "60", "--scenario", "toy", "--agent", "planner:Agent")
-    done = toy.crashhunt(*words)
-    assert "build/planner is ignored by git, so the snapshot lacks it; add --snapshot-root build/planner" in done.out
-    for root in ("build", "build/planner"):
-        shutil.rmtree(toy.folder / "h")
-        assert "snapshot lacks" not in toy.crashhunt(*words, "--snapshot-root", root).out
-    toy.crashhunt("export", "h", "crash.zip")
-    for name in ("h", "build"):
-        shutil.rmtree(toy.folder / name)
-    assert toy.crashhunt("replay", "crash.zip", "--json").json["verdict"] == "reproduced"

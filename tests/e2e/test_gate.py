@@ -105,23 +105,6 @@ def repository(drivers):
 IN_REPOSITORY = ("--scenario", "../toy", "--set", "gap_m=20:30", "--max-steps", "99", "--agent", CALM, *SEED)
 
 
-@pytest.mark.nightly
-def test_crash_that_comes_back_in_the_corpus_of_head_is_worse_without_any_trial(repository):
-    words = ("--scenario", "../toy", "--agent", CALM, "--arg", "speed=14", "--seed", "1")
-    repository.crashhunt("run", "../h", "1", "9", "99", *words)
-    repository.crashhunt("corpus", "add", "../h", "--to", "crashes", "--expect", "fixed", "--note", "too fast")
-    git(repository.folder, "add", "crashes")
-    git(repository.folder, "commit", "-qm", "a case")
-    words = ("--junit", "../j.xml", "--json")
-    found = repository.crashhunt("gate", "calm", "HEAD", *IN_REPOSITORY, *words, expect=1).json
-    assert (found["verdict"], found["pairs"]) == ("worse", 0)
-    assert found["why"] == "a crash of the corpus that was fixed has come back"
-    assert found["corpus"]["ok"] is False
-    assert len(found["corpus"]["failed"]) == 1
-    case = ET.parse(repository.folder.parent / "j.xml").find("testsuite/testcase")
-    assert case.find("failure").get("type") == "came_back"
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     one_in(
@@ -159,40 +142,6 @@ def test_bad_input_is_one_line_that_names_it(repository, words, says):
     assert "Traceback" not in done.err
     assert len(done.err.splitlines()) == 1
     assert len(git(repository.folder, "worktree", "list").splitlines()) == 1
-
-
-SUITE = """
-[defaults]
-trials = 5
-max_steps = 99
-scenario_arguments.gap_m = "20:30"
-[[hunts]]
-id = "near"
-scenario = "toy"
-runs = 2
-[[hunts]]
-id = "far"
-scenario = "toy"
-scenario_arguments.gap_m = "50:60"
-"""
-
-
-@pytest.mark.nightly
-def test_hunts_of_a_suite_are_compared_one_after_the_other(drivers):
-    (drivers.folder / "s.toml").write_text(SUITE)
-    words = ("--suite", "s.toml", "--most", "8", "--json", "--keep", "kept", "--margin", "0")
-    found = drivers.crashhunt("gate", WILD, CALM, *words, *SEED, expect=3).json
-    assert [(one["name"], one["pairs"]) for one in found["scenarios"]] == [("near.0", 3), ("near.1", 3), ("far.0", 2)]
-    assert found["pairs"] == 8
-    words = ("--suite", "s.toml", "--json", "--keep", "other")
-    drivers.crashhunt("gate", CALM, WILD, *words, "--most", "6", expect=3)
-    runs = (specs(drivers.folder / "other" / run / "head").values() for run in ("near.0", "near.1"))
-    assert len({spec["seed"] for run in runs for spec in run}) == 4  # each hunt has a seed of its own
-    worse = drivers.crashhunt("gate", CALM, WILD, *words, "--most", "30", expect=1).json
-    assert [one["pairs"] for one in worse["scenarios"]] == [8, 0, 0]  # which ends it at once
-    (drivers.folder / "s.toml").write_text(SUITE.replace("runs = 2", 'sampler = "guided"'))
-    refused = drivers.crashhunt("gate", CALM, WILD, "--suite", "s.toml", expect=2)
-    assert "near.0: a gate compares single trials and does not support the sampler guided" in refused.err
 
 
 def trials_of(folder):

@@ -5,45 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import signal
-import subprocess
-import time
 
 import pytest
-from conftest import CRASHHUNT, keeps_going, wait_for
+from conftest import keeps_going
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
-
-
-def state(shell, hunt: str = "h") -> dict:
-    (found,) = shell.crashhunt("status", hunt, "--json").json["hunts"]
-    return found
-
-
-def started(shell, *words: str):
-    process = shell.begin("run", "h", "2", "50000", "50", *KEEP, "--set", "step_wall_s=0.001", *words)
-    ledger = shell.folder / "h/ledger.sqlite"
-    wait_for(lambda: ledger.exists() and state(shell)["trials_run"] >= 5, every_s=0.05)
-    return process
-
-
-@pytest.mark.nightly
-def test_watching_ends_with_the_hunt(toy):
-    process = started(toy, "--timeout", "9")
-    watching = subprocess.Popen(
-        [str(CRASHHUNT), "status", "h", "--watch"],
-        cwd=toy.folder,
-        env=toy.environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    time.sleep(1.5)
-    assert watching.poll() is None
-    process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=300)
-    out, _ = watching.communicate(timeout=300)
-    assert watching.returncode == 0
-    assert "interrupted" in out
 
 
 @pytest.mark.nightly

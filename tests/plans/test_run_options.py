@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import filecmp
 import inspect
 import json
-import os
-import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,90 +22,6 @@ from crashhunt.plans import (
 from crashhunt.replays import ReplayOptions
 from crashhunt.snapshots import SnapshotOptions
 from crashhunt.suites import RunRequest, Suite, SuiteEntry
-
-PACKAGE = Path(crashhunt.__file__).parent
-LIST = "plans/_run_options.py"
-ADDED = """
-    warm_up_s: float = option(
-        2.5, "driven before anything counts, in s", flag="--warm-up", metavar="S", check=above_zero("give more"),
-    )
-    witnesses: Sequence[str] = option((), "who is asked", flag="--witness", metavar="NAME")
-    hints: Mapping[str, Spec] | None = option({}, "what helps", flag="--hint", metavar="NAME=VALUE")
-"""
-ASKS = """
-import json, pathlib
-from crashhunt.errors import UsageError
-import crashhunt
-from crashhunt.plans import plan, read_settings, write_settings
-from crashhunt.replays import ReplayOptions
-from crashhunt.snapshots import SnapshotOptions
-from crashhunt.suites import RunRequest, Suite
-hunt = crashhunt.prepare("p", 1, 1, 5, scenario="toy", seed=1, warm_up_s=4, witnesses=["a", "b"], hints={"n": 3})
-folder, = Suite.read("suite.toml").plan("s")
-written = json.loads((folder / "request.json").read_text())["request"]
-planned = RunRequest.read(folder / "request.json").request
-told = read_settings(pathlib.Path("h/hunt.toml"))
-try:
-    crashhunt.run("p", 1, 1, 5, warm_up_s=-1)
-except UsageError as error:
-    refused = str(error)
-def both(settings):
-    return [settings.run.warm_up_s, list(settings.witnesses), settings.hints]
-print(json.dumps({
-    "python": both(hunt.settings), "documented": "warm_up_s: driven before" in crashhunt.run.__doc__,
-    "suite.toml": both(planned), "request.json": [written["run"]["warm_up_s"], written["witnesses"], written["hints"]],
-    "hunt.toml": both(told), "refused": refused,
-}))
-"""
-
-
-@pytest.mark.nightly
-def test_an_option_that_is_added_to_the_list_is_everywhere(toy):
-    copy = toy.folder / "elsewhere" / "crashhunt"
-    shutil.copytree(PACKAGE, copy)  # with what Python has compiled, which holds for files of the same age and size
-    text = (copy / LIST).read_text()
-    decides, runs = "class TrialOptions(_Options):\n", "class RunOptions(_Options):\n"
-    lines = ADDED.partition("    witnesses")
-    for marker, added in ((decides, lines[1] + lines[2]), (runs, lines[0])):
-        head, found, rest = text.partition(marker)
-        assert found
-        doc, _, body = rest.partition("\n\n")
-        text = f"{head}{marker}{doc}\n\n{added}{body}"
-    (copy / LIST).write_text(text)
-    changed = [
-        str(file.relative_to(copy))
-        for file in copy.rglob("*.py*")
-        if file.suffix != ".pyc" and not filecmp.cmp(file, PACKAGE / file.relative_to(copy), shallow=False)
-    ]
-    assert changed == [LIST]
-
-    environment = {**os.environ, "PYTHONPATH": str(copy.parent)}
-
-    def asked(*words):
-        done = subprocess.run(
-            [sys.executable, "-P", *words], cwd=toy.folder, env=environment, capture_output=True, text=True,
-            timeout=300, check=False,
-        )  # fmt: skip
-        assert not done.returncode, done.stderr
-        return done.stdout
-
-    words = ("--scenario", "toy", "--seed", "1", "--warm-up", "3", "--witness", "x", "--witness", "y", "--hint", "n=1")
-    asked("-m", "crashhunt", "run", "h", "1", "1", "5", *words)
-    assert 'witnesses = [\n    "x",\n    "y",\n]\n' in (toy.folder / "h" / "hunt.toml").read_text()
-    assert "--warm-up S           driven before anything counts, in s; default: 2.5" in asked(
-        "-m", "crashhunt", "run", "--help-all"
-    )
-    (toy.folder / "suite.toml").write_text(
-        '[[hunts]]\nid="a"\nscenario="toy"\nwarm_up_s=5\nwitnesses=["z"]\nhints={n=2}\n'
-    )
-    assert json.loads(asked("-c", ASKS)) == {
-        "python": [4, ["a", "b"], {"n": 3}],
-        "documented": True,
-        "suite.toml": [5.0, ["z"], {"n": 2}],
-        "request.json": [5.0, ["z"], {"n": 2}],
-        "hunt.toml": [3.0, ["x", "y"], {"n": "1"}],
-        "refused": "--warm-up is -1; give more",
-    }
 
 
 def test_python_has_the_options_of_the_list():

@@ -334,14 +334,6 @@ def test_driver_repeats_the_log_and_brakes_after_its_step(monkeypatch):
     assert meta.act(None) == 2
 
 
-def test_overruled_driver_may_act_after_the_end_of_its_log(monkeypatch):
-    log = SimpleNamespace(actions=lambda agent: ["first"])
-    monkeypatch.setattr("crashhunt.testing._last_avoidable_step_check.read_log", lambda path: log)
-    agent = RecordedThenBrakes("log.mcap", "ego", _last_avoidable_step._NEVER, None)
-    assert [agent.act(None) for _ in range(3)] == ["first"] * 3
-    assert agent._after > 10**6
-
-
 @dataclass(frozen=True)
 class Worker:
     scenario: object
