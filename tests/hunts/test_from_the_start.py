@@ -19,8 +19,8 @@ from crashhunt.hunts._fork_results import (
     verify_probes,
     verify_rare,
 )
-from crashhunt.hunts._progress import PhaseClock, Progress
-from crashhunt.hunts._verification import ForkCrash, VerificationRuns, keep_near_misses
+from crashhunt.hunts._progress import Progress
+from crashhunt.hunts._verification import keep_near_misses
 from crashhunt.trial import (
     KILLED,
     Branch,
@@ -35,44 +35,6 @@ from crashhunt.trial import (
     TrialResult,
     TrialSpec,
 )
-
-FOUND = ForkCrash(TrialSpec(3, 1, {"ego": {}}, {}, 9), "collision", 5)
-
-
-def runs(tmp_path, stops, run):
-    (tmp_path / "probes" / "000001-collision").mkdir(parents=True)
-    return SimpleNamespace(setup=SimpleNamespace(place=SimpleNamespace(path=tmp_path)), is_stopped=bool(stops), run=run,
-                           progress=Progress(), phases=PhaseClock(lambda _: None, 2))  # fmt: skip
-
-
-def test_the_one_that_stops_keeps_what_there_was(tmp_path):
-    copies = VerificationRuns(runs(tmp_path, [2], None), None)
-    assert (copies.crashes([FOUND], "probes", "probes"), copies.is_stopped) == (((), 0), True)
-    assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000001-collision"]
-
-
-def test_what_cannot_be_run_is_reported_and_the_hunt_has_ended_well(tmp_path):
-    def fails(specs, folder):
-        assert ([*specs], folder) == ([FOUND.spec], "probes")
-        yield from ()
-        raise SimulatorError("no room")
-
-    again = runs(tmp_path, [], fails)
-    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), 1)
-    assert again.progress.notes == ["what copies have found could not be run from the start: no room"]
-    assert not (tmp_path / "probes").exists()
-
-
-@pytest.mark.parametrize(("outcome", "step"), [("survived", 5), ("collision", 6), ("hang", 5)])
-def test_another_end_is_no_crash_of_it(tmp_path, outcome, step):
-    def another(specs, folder):
-        for spec in specs:
-            yield SimpleNamespace(result=TrialResult(spec, Outcome(outcome), steps=step))
-
-    again = runs(tmp_path, [], another)
-    is_late = outcome == "hang"  # as on a busy machine: it is run again by the same command
-    assert VerificationRuns(again, None).crashes([FOUND], "probes", "probes") == ((), int(is_late))
-    assert [result.steps for result in again.progress.failed] == [step] * (not is_late)
 
 
 class Copies:
@@ -181,16 +143,6 @@ def test_a_deterministic_hunt_that_is_resumed_runs_trials_of_lower_numbers_first
         trials.upcoming = 4
         assert at.look() is waits
         assert progress.last_wanted == 3
-
-
-def test_what_is_kept_is_not_run_again_and_stays(tmp_path):
-    kept = tmp_path / "probes" / "000003-collision"
-    again = runs(tmp_path, [], lambda specs, folder: iter([] if not specs else 1 / 0))
-    kept.mkdir()
-    bundle = SimpleNamespace(path=kept, result=SimpleNamespace(spec=FOUND.spec))
-    copies = VerificationRuns(again, None, {"probes": {3: bundle}})
-    assert copies.crashes([FOUND], "probes", "probes") == ((bundle,), 0)
-    assert [path.name for path in (tmp_path / "probes").iterdir()] == ["000003-collision"]
 
 
 # The sums of all trials, and what is run from the start at the end of a hunt.

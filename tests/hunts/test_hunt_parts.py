@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -106,17 +106,6 @@ def loop(running):
     return make
 
 
-def test_trials_above_a_wanted_crash_are_cancelled(loop):
-    cancelled = []
-    for deterministic, left in ((True, {1, 4}), (False, set())):
-        found = loop(deterministic=deterministic)
-        found._executor = SimpleNamespace(cancel=lambda *, above: cancelled.append(above))
-        found._in_flight = {1, 4, 5}
-        found._cancel_above(4)
-        assert found._in_flight == left
-    assert cancelled == [4, -1]
-
-
 def test_results_reach_the_sampler_late_enough_for_every_worker():
     free, fixed = RunSettings(deterministic=False), RunSettings(deterministic=True)
     assert _next_trials.trials_under_way(3) == 6
@@ -170,23 +159,6 @@ def test_notices_of_workers_and_differences_of_the_audit_are_noted(running, loop
     assert running.ledger.noted == [{"notices": ["a"]}, {"notices": ["a", "b"]}]  # each once
     assert looks == ["executor"] * 2
     assert counted == [(found._audit, running.progress)]
-
-
-def test_notice_of_an_absent_name_is_kept_until_the_name_occurs(running, loop):
-    ledger, progress, occurred = running.ledger, running.progress, [(), ("x names",)]
-    progress.look_at = lambda executor: None
-    found = loop()
-    found._executor, found._audit = None, SimpleNamespace(look=lambda wait_s: [])
-    found._notices = SimpleNamespace(
-        take=lambda executor: ["a"],
-        absent=lambda *, at_end: ["x names nothing"] * at_end,
-        newly_occurred=lambda: occurred.pop(0),
-    )
-    found._receive_notices(at_end=True)
-    assert progress.notes == ledger.facts()["notices"] == ["a", "x names nothing"]
-    found._receive_notices()
-    assert progress.notes == ["a", "a"]
-    assert ledger.facts()["notices"] == ["a"]
 
 
 def test_rest_of_an_audit_is_a_phase_of_its_own(running, loop):
@@ -244,53 +216,6 @@ def test_hunt_that_fails_records_why(hunt, monkeypatch):
 
     ledger.enter = fails
     hunt._fail(ledger, "no disk")
-
-
-@pytest.mark.parametrize(
-    ("error", "raised", "why"),
-    [
-        (CrashhuntError("no map", fix="draw one"), CrashhuntError, "no map; draw one"),
-        (
-            OSError(28, "No space left", "/h/box"),
-            HuntDirectoryError,
-            "/h/box: No space left; free some space or make the folder writable, and run the same command again",
-        ),
-        (ValueError("odd"), ValueError, "ValueError: odd"),
-    ],
-)
-def test_error_of_a_hunt_is_in_its_ledger(hunt, monkeypatch, error, raised, why):
-    found, failed, noted, removed = hunt, [], [], []
-
-    @contextmanager
-    def locked():
-        yield
-
-    @contextmanager
-    def stops():
-        yield ()
-
-    ledger = SimpleNamespace(note=lambda **facts: noted.append(facts), close=lambda: noted.append("closed"))
-    found._place = SimpleNamespace(
-        locked=locked, claim=lambda *given, **more: SETTINGS, settings_before=None, scratch="scratch", has_begun=True
-    )
-    monkeypatch.setattr(_hunt, "stop_requests", stops)
-    monkeypatch.setattr(_hunt, "Ledger", lambda path, *, writable, wait: ledger if writable else None)
-    monkeypatch.setattr(_hunt, "remove_scratch", removed.append)
-    monkeypatch.setattr(found, "_fail", lambda given, reason: failed.append((given, reason)))
-
-    def run(given, watch):
-        watch("status")
-        raise error
-
-    monkeypatch.setattr(found, "_run", run)
-    with pytest.raises(raised):
-        found.run()
-    assert failed == [(ledger, why)]
-    assert noted[0]["owner"] is None
-    assert noted[0]["heartbeat"] == pytest.approx(time.time(), abs=5)
-    assert (noted[1], removed) == ("closed", ["scratch"])
-    monkeypatch.setattr(found, "_run", lambda given, watch: "report")
-    assert found.run() == "report"
 
 
 def test_hunt_waits_for_a_locked_ledger_and_reports_it(running):

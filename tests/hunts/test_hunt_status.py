@@ -9,9 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.hunts._progress import HuntStatus, Progress
-from crashhunt.trial import Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
-
-BRAKE = Disturbance(5, "ahead", "brake", 4.0, 2.0, "ego")
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
 def result(number=0, outcome=Outcome.SURVIVED, *, origin="", **evidence):
@@ -67,33 +65,10 @@ def counted(*results, crashed=()):
     return progress
 
 
-def test_nearest_trial_is_the_most_critical_one_without_a_crash():
-    far, near, crash = result(0, danger=0.2), result(1, danger=0.7), result(2, Outcome.COLLISION, danger=1.0)
-    failed = result(3, Outcome.AGENT_ERROR, failure=Failure("E", "e"), danger=0.9)
-    progress = counted(far, near, far, crash, failed, crashed=(2, 3))
-    assert progress.nearest is near
-    assert progress.found == {2: crash, 3: failed}
-    assert dict(progress.outcomes) == {"survived": 3, "collision": 1, "agent_error": 1}
-    assert (progress.last_wanted, progress.unsaved, progress.crash_count, progress.disturbed) == (2, crash, 1, 0)
-    assert progress.is_done is False  # nothing is saved
-    status = progress.searching.status()
-    assert status.grown_trials == 3  # since the second trial
-
-
 def test_last_invalid_trial_is_kept_unless_it_counts_as_a_crash():
     invalid = result(0, Outcome.INVALID)
     assert counted(invalid, result(1)).last_invalid is invalid
     assert counted(invalid, crashed=(0,)).last_invalid is None
-
-
-def test_least_robust_trial_and_crashed_branches_are_counted():
-    weak = result(1, stress=Stress(0.25, disturbance=BRAKE))
-    progress = counted(
-        result(0, stress=Stress(0.5, disturbance=BRAKE)), weak, result(2, stress=Stress(0.75, disturbance=BRAKE)),
-        result(3, stress=Stress(0.125)), result(4, branches=Branches(unanswered=1)),
-    )  # fmt: skip
-    assert progress.stressed is weak
-    assert (progress.branched, progress.not_fully_asked) == (0, 1)
 
 
 def test_rate_on_the_last_screen_counts_every_trial():

@@ -17,17 +17,14 @@ import pytest
 
 import crashhunt
 from crashhunt.base import layout
-from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import _hunt, check, salvage
-from crashhunt.hunts._audits import Audit
 from crashhunt.hunts._next_trials import Unanswered, find_unanswered
 from crashhunt.hunts._progress import Progress
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.results import find_hunts, find_searches, hunt_state, is_hunt, load
 from crashhunt.results._hunt_state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 
@@ -361,16 +358,6 @@ def test_salvage_refuses_a_directory_that_has_something_and_names_what_cannot_be
     with pytest.raises(HuntDirectoryError, match=r"cannot be written: \[Errno 5\] Input/output error"):
         salvage(checked, tmp_path / "s")
     assert not (tmp_path / "s").exists()
-
-
-def test_audit_that_is_closed_leaves_no_process(tmp_path, monkeypatch):
-    closed = []
-    executor = SimpleNamespace(close=lambda: closed.append(True))
-    monkeypatch.setattr("crashhunt.hunts._audits.FreshProcessExecutor", lambda settings: executor)
-    toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    settings = WorkerSettings(scenario=toy, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
-    Audit(settings, []).close()
-    assert closed == [True]
 
 
 def load_quietly(path):
