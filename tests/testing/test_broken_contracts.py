@@ -269,7 +269,7 @@ NAMES, MAP = "test_columns_have_a_name_each", "test_the_map_has_every_lane_once"
     [
         (ToySimulator, set()),
         (SameTraffic, {ONLY_SEED}),
-        (Remembers, {ONLY_SEED, RESEEDED}),
+        (Remembers, {ONLY_SEED, RESEEDED, ERRS}),
         (Errs, {ERRS}),
         (Lasts, {ERRS}),
         (Declines, set()),
