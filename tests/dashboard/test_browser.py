@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import sqlite3
-from contextlib import closing, suppress
+from contextlib import closing
 
 import pytest
 from conftest import add_toy, crashes_on_loop
@@ -57,26 +56,6 @@ def test_a_hunt_that_is_started_while_the_page_is_open_appears_and_its_crash_pla
         finally:
             ended(hunt)
     assert page.faults() == []
-
-
-@pytest.mark.nightly
-def test_a_hunt_that_is_killed_shows_as_killed(shell, page):
-    root = shell.folder / "runs"
-    root.mkdir()
-    with served(root) as dashboard:
-        words = ("--arg", "speed=5", "--seed", "1", "--keep-going")
-        hunt = shell.start("run", "runs/one", "1", "3000", "800", *words, start_new_session=True)
-        try:
-            page.open(dashboard.url)
-            page.wait("document.querySelector('tbody .state')?.innerText === 'running'")
-            page.wait("!document.querySelector('tbody').innerText.includes('0 of 3,000')")
-            os.kill(hunt.pid, signal.SIGKILL)
-            hunt.wait(300)
-            page.wait("document.querySelector('tbody .state').innerText === 'killed'")
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(hunt.pid, signal.SIGKILL)
-            hunt.communicate(timeout=60)
 
 
 def test_texts_of_strangers_are_text_on_every_page(hunts, page):

@@ -8,7 +8,6 @@ import sqlite3
 from contextlib import closing
 
 import pytest
-from conftest import wait_for
 
 
 def results(folder):
@@ -112,24 +111,6 @@ def until(toy, folder, workers, trials, rate, *words, expect):
 def test_hunt_that_cannot_decide_ends_at_most_and_exits_with_3(toy):
     found = until(toy, "h", "1", "0", "0.3/trial", *FEW, "--most", "3", expect=3)
     assert (found["stopped_because"], found["trials_run"], found["rate"]["verdict"]) == ("all_trials", 3, "undecided")
-
-
-@pytest.mark.nightly
-def test_killed_hunt_decides_as_one_that_was_never_killed(toy):
-    slow = ("--set", "step_wall_s=0.002")
-    whole = until(toy, "whole", "2", "0", "0.02/trial", *slow, expect=1)["rate"]
-    process = toy.begin("run", "parts", "2", "0", *HUNT, "--until-rate", "0.02/trial", *slow)
-    wait_for(lambda: _has_trials(toy.folder / "parts"), every_s=0.01, process=process)
-    process.kill()
-    process.communicate(300)
-    assert until(toy, "parts", "2", "0", "0.02/trial", *slow, expect=1)["rate"] == {**whole, "dir": "parts"}
-
-
-def _has_trials(folder):
-    try:
-        return bool(results(folder))
-    except sqlite3.Error:
-        return False
 
 
 def test_hunt_with_too_many_invalid_trials_ends_with_a_line(toy):

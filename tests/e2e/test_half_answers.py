@@ -137,27 +137,3 @@ def test_margin_of_a_trial_whose_copies_are_killed_is_open_until_they_are_asked_
     assert table(shell, "h") == (wanted, wanted_copies)
     assert again["steps_total"] == undisturbed["steps_total"]
     assert shell.crashhunt("check", "h").code == 0
-
-
-@pytest.mark.nightly
-def test_trial_that_is_killed_at_different_steps_is_invalid_until_it_is_run_again(shell, folder):
-    words = ("run", "h", *HUNT, "--agent", "faulty:Waits")
-    steps, waits = ["3", "12", "21", ""], folder / "waits"
-    (folder / "wait-at").write_text(steps[0])
-    process = shell.start(*words)
-    for following in steps[1:]:
-        wait_for(waits.exists, every_s=0.002)
-        killed = int(waits.read_text())
-        waits.unlink()
-        (folder / "wait-at").write_text(following)
-        os.kill(killed, signal.SIGKILL)
-    out, err = process.communicate(timeout=300)
-    report = json.loads(out)
-    assert (report["outcomes"], report["crashes"], report["unanswered"]) == ({"invalid": 1, "survived": 1}, [], 1)
-    assert (
-        "1 trial has incomplete answers: processes were killed from outside. Run the same command to run it again."
-        in err
-    )
-    again = shell.crashhunt(*words).json
-    assert (again["outcomes"], again["trials_run"], again["unanswered"]) == ({"survived": 2}, 2, 0)
-    assert shell.crashhunt("check", "h").code == 0

@@ -6,19 +6,9 @@ import csv
 import json
 import shutil
 
-import pytest
 from conftest import keeps_going
 
 KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
-
-
-@pytest.mark.nightly
-def test_a_hunt_whose_scenario_is_gone_runs_again_from_its_snapshot(toy):
-    toy.crashhunt("run", "h", "1", "5", "50", *KEEP, "--arg", "speed=4")
-    (toy.folder / "toy/scenario.toml").unlink()
-    done = toy.crashhunt("rerun", "h", "--to", "again", "--json").json
-    assert done["hunts"][0]["outcomes"] == {"survived": 5}
-    assert [row["digest"] for row in rows(toy, "again")] == [row["digest"] for row in rows(toy, "h")]
 
 
 def rows(shell, hunt: str, *words: str) -> list[dict]:

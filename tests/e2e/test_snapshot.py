@@ -61,10 +61,6 @@ def project(toy):
     return toy
 
 
-def snapshots(shell) -> list:
-    return sorted((shell.folder.parent / "out" / "snapshots").iterdir(), key=lambda path: path.stat().st_mtime_ns)
-
-
 def test_a_crash_replays_when_the_project_is_gone(project):
     project.crashhunt(*RUN)
     shutil.rmtree(project.folder)
@@ -73,14 +69,3 @@ def test_a_crash_replays_when_the_project_is_gone(project):
     shutil.copytree(project.folder / "out", project.folder / "elsewhere")
     shutil.rmtree(project.folder / "out")
     assert project.crashhunt("replay", "elsewhere", "--json").json["verdict"] == "reproduced"
-
-
-@pytest.mark.nightly
-def test_a_large_work_tree_is_kept_whole(project):
-    for number in range(3000):
-        folder = project.folder / "many" / str(number % 50)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{number}.txt").write_text(str(number))
-    project.crashhunt(*RUN)
-    (snapshot,) = snapshots(project)
-    assert len(list((snapshot / "code" / "@my project" / "many").rglob("*.txt"))) == 3000

@@ -105,20 +105,6 @@ def kill_replays(whom, trials="trial-000000"):
     return end
 
 
-@pytest.mark.nightly
-def test_replay_killed_at_three_steps_is_run_three_times(bundle):
-    end = kill_replays(
-        lambda _scratch, header, before: header.pid if before < 3 and header.step >= 3 + 8 * before else None
-    )
-    try:
-        found = confirm(replace(bundle, confirmed=None))
-    finally:
-        count = end()
-    assert (count, found.confirmed) == (3, None)
-    assert found.why_unconfirmed.startswith("the replay was killed from outside 3 times, each time at another step")
-    assert confirm(found).confirmed is True
-
-
 def parent_of(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
