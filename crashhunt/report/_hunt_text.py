@@ -38,11 +38,7 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
     text has each crash type with its shortest crash, and the counts of the hunt follow. With a dashboard, the last line
     is the command that shows the crashes in it.
     """
-    ran = sum(report.outcomes.values())
-    outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
-    total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
-    count = f"{out_of(ran, report.settings.trials)} trials, {report.trial_steps} steps{total}"
-    counts = f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"
+    counts = _describe_counts(report)
     has_types = report.kinds is not None and sum(group.count for group in report.kinds) > 1
     lines = [] if has_types else [counts]
     if report.stopped_because == "no_valid_trial":
@@ -50,7 +46,36 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
     if report.code_versions:
         lines.append(f"Note: {describe_versions(map(asdict, report.code_versions))}")
     lines += [f"Note: {note}" for note in report.notes]
-    lines += _describe_audit(report)
+    lines += [*_describe_audit(report), *_describe_end(report), *_describe_events(report)]
+    lines += [*describe_probes(report), *describe_branches(report)]
+    lines += report.rare.lines if report.rare is not None else []
+    lines += describe_disturbances(report)
+    if report.at_fault is not None and report.crashes:
+        all_of_them = report.tally.found
+        what = "crash is" if all_of_them == 1 else "crashes are"
+        lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
+    if has_types:
+        lines += [*([""] if lines else []), *_describe_types(report), *_near_misses(report), "", counts]
+    else:
+        lines += [*_describe_crashes(report), *_near_misses(report)]
+    if report.copied is not None:
+        lines += ["", *describe_crash(report.copied)]
+        lines += ["", f"Replay it:  {command_line('crashhunt', 'replay', report.copied.path)}"]
+    return in_lines([*lines, *_next_commands(report, has_types=has_types, has_dashboard=has_dashboard)])
+
+
+def _describe_counts(report: HuntReport) -> str:
+    """Return the numbers of trials and steps, the time, the outcomes and the seed of a hunt as text."""
+    ran = sum(report.outcomes.values())
+    outcomes = ", ".join(f"{name} {count}" for name, count in report.outcomes.items()) or "none"
+    total = f" ({report.steps_total} simulated in all)" if report.steps_total > report.trial_steps else ""
+    count = f"{out_of(ran, report.settings.trials)} trials, {report.trial_steps} steps{total}"
+    return f"{count}, {format_seconds(report.wall_s)} ({outcomes}); hunt seed {report.settings.seed}"
+
+
+def _describe_end(report: HuntReport) -> list[str]:
+    """Return as text why the hunt ended, and what the same command would complete."""
+    lines = []
     if report.stopped_because == "distinct":
         lines.append(f"Found {_wanted_types(report)} (--distinct {report.settings.run.distinct}).")
     if report.rate is not None:
@@ -59,8 +84,7 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
         number = report.copied.result.spec.number
         lines.append(f"Trial {number} did not crash, but a copy of it did. The crash reproduces from the start.")
     if report.unanswered:
-        one = report.unanswered == 1
-        trials, them = ("trial has", "it") if one else ("trials have", "them")
+        trials, them = ("trial has", "it") if report.unanswered == 1 else ("trials have", "them")
         why = "processes were killed from outside"
         fix = f"Run the same command to run {them} again."
         lines.append(f"{report.unanswered} {trials} incomplete answers: {why}. {fix}")
@@ -70,35 +94,25 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
     elif report.stopped_because == "interrupted":
         lines.append("Interrupted. Run the same command to resume.")
     if not report.crashes and report.stopped_because in ("all_trials", "time"):
-        lines.append(
-            "No crash was found."
-            if report.stopped_because == "all_trials"
-            else "No crash was found within the time limit."
-        )
-    lines += _describe_events(report)
-    lines += describe_probes(report)
-    lines += describe_branches(report)
-    lines += report.rare.lines if report.rare is not None else []
-    lines += describe_disturbances(report)
-    if report.at_fault is not None and report.crashes:
-        all_of_them = report.tally.found
-        what = "crash is" if all_of_them == 1 else "crashes are"
-        lines.append(f"{len(report.at_fault)} of {all_of_them} {what} the agent's own fault.")
+        limit = " within the time limit" if report.stopped_because == "time" else ""
+        lines.append(f"No crash was found{limit}.")
+    return lines
+
+
+def _describe_crashes(report: HuntReport) -> list[str]:
+    """Return the first crashes in full, and the number of all."""
     crashes = by_likelihood(report.crashes)
-    if has_types:
-        lines += [*([""] if lines else []), *_describe_types(report)]
-    else:
-        for bundle in crashes[:_MAX_BLOCKS]:
-            lines += ["", *describe_crash(bundle)]
-        if len(crashes) > _MAX_BLOCKS:
-            lines += ["", f"{_MAX_BLOCKS} of {report.tally.found} crashes shown; all are in {_crash_folder(report)}"]
-    lines += _near_misses(report)
-    lines += ["", counts] if has_types else []
-    if report.copied is not None:
-        lines += ["", *describe_crash(report.copied)]
-        lines += ["", f"Replay it:  {command_line('crashhunt', 'replay', report.copied.path)}"]
+    lines = [line for bundle in crashes[:_MAX_BLOCKS] for line in ("", *describe_crash(bundle))]
+    if len(crashes) > _MAX_BLOCKS:
+        lines += ["", f"{_MAX_BLOCKS} of {report.tally.found} crashes shown; all are in {_crash_folder(report)}"]
+    return lines
+
+
+def _next_commands(report: HuntReport, *, has_types: bool, has_dashboard: bool) -> list[str]:
+    """Return the commands that show the crashes of a hunt, one line each."""
+    lines = []
     if report.crashes:
-        chosen = ["--crash", crashes[0].id] if len(crashes) > 1 else []
+        chosen = ["--crash", by_likelihood(report.crashes)[0].id] if len(report.crashes) > 1 else []
         replay = command_line("crashhunt", "replay", report.directory, *chosen)
         lines += [f"Replay one:  {replay}"] if has_types else ["", f"Replay it:  {replay}"]
         lines += [f"Show one:    {command_line('crashhunt', 'show', report.directory, *chosen)}"] if has_types else []
@@ -107,7 +121,7 @@ def describe_hunt(report: HuntReport, *, has_dashboard: bool = False) -> str:
     if has_dashboard and report.crashes:
         space = " " * has_types  # the labels before it are longer then
         lines.append(f"Look at it: {space}{command_line('crashhunt', 'dashboard', report.directory)}")
-    return in_lines(lines)
+    return lines
 
 
 def _crash_folder(report: HuntReport) -> str:
