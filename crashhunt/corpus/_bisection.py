@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,33 +96,16 @@ def bisect(
         for agent in settings.agents.values()
         if not agent.agent.startswith("crashhunt.") and not is_program(agent.agent)
     }
-    tried: dict[str, Got] = {}
     with temporary_folder("bisect") as scratch, checked_out(top, ends[1], purpose="bisect") as tree:
-        case = add_case(bundle, scratch / "corpus").case.path.resolve()
-
-        inside, why = tree / folder.relative_to(top), ""
+        inside = tree / folder.relative_to(top)
         for name, values in settings.texts.items():
             for path in files_outside(values, (inside, scratch)):
                 tell(f"every revision uses the same file: {path} ({name}), which the work tree does not contain")
-
-        def run() -> Got:
-            nonlocal why
-            revision, why = git(tree, "rev-parse", "HEAD"), ""
-            try:
-                if build:
-                    run_build(build, inside, None, limit_s=build_limit_s, name=revision[:12], tell=tell)
-                got, why = _run(case, inside, tree, modules)
-            except BuildError as error:
-                got, why = "cannot_run", str(error)
-            tried[revision] = got
-            if build:
-                clean_tree(tree)
-            watch(revision, got, why)
-            return got
-
-        _require_status(run(), "still", bad, "--bad", why, has_build=bool(build))
+        case = add_case(bundle, scratch / "corpus").case.path.resolve()
+        revisions = _Revisions(case, inside, tree, modules, build, build_limit_s, watch, tell)
+        revisions.require("still", bad, "--bad")
         git(tree, "checkout", "--quiet", "--detach", ends[0])
-        _require_status(run(), "fixed", good, "--good", why, has_build=bool(build))
+        revisions.require("fixed", good, "--good")
         said = git(tree, "bisect", "start", ends[1], ends[0])
         judged = set()
         while not (found := _FIRST_BAD_COMMIT.search(said)) and "only 'skip'ped commits left" not in said:
@@ -130,35 +113,62 @@ def bisect(
             if head in judged:  # git proposes the same revision again if it finds no path
                 raise _no_way(good, bad, head)
             judged.add(head)
-            said = git(tree, "bisect", _BISECT_WORDS[tried[head] if head in tried else run()], skipped=True)
-        if found is not None:
-            return Bisected(
-                commit=found[1],
-                subject=git(tree, "log", "-1", "--format=%s", found[1]),
-                candidates=(),
-                tried=tried,
-            )
+            got = revisions.tried[head] if head in revisions.tried else revisions.run()[0]
+            said = git(tree, "bisect", _BISECT_WORDS[got], skipped=True)
+        commit = found[1] if found is not None else None
         return Bisected(
-            commit=None,
-            subject="",
-            candidates=tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
-            tried=tried,
+            commit=commit,
+            subject=git(tree, "log", "-1", "--format=%s", commit) if commit is not None else "",
+            candidates=() if commit is not None else tuple(re.findall(r"^[0-9a-f]{40,64}$", said, re.MULTILINE)),
+            tried=revisions.tried,
         )
+
+
+@dataclass
+class _Revisions:
+    """Runs the case of a crash with the revision that is checked out."""
+
+    case: Path
+    folder: Path
+    tree: Path
+    modules: set[str]
+    build: str
+    build_limit_s: float
+    watch: Callable[[str, Got, str], None]
+    tell: Callable[[str], None]
+    tried: dict[str, Got] = field(default_factory=dict)
+
+    def run(self) -> tuple[Got, str]:
+        """Build the revision and run the case; return the status of the crash, and why the case cannot run."""
+        revision = git(self.tree, "rev-parse", "HEAD")
+        try:
+            if self.build:
+                name, limit_s = revision[:12], self.build_limit_s
+                run_build(self.build, self.folder, None, limit_s=limit_s, name=name, tell=self.tell)
+            got, why = _run(self.case, self.folder, self.tree, self.modules)
+        except BuildError as error:
+            got, why = "cannot_run", str(error)
+        self.tried[revision] = got
+        if self.build:
+            clean_tree(self.tree)
+        self.watch(revision, got, why)
+        return got, why
+
+    def require(self, expected: Got, revision: str, option: str) -> None:
+        """Run the case, and refuse a revision with another status than the option demands."""
+        got, why = self.run()
+        if why:
+            fix = "" if self.build else ", or --build COMMAND if the agent needs files that Git does not track"
+            raise UsageError(f"{option} {revision} cannot run: {why}", fix=f"give another revision{fix}")
+        if got != expected:
+            message = f"{option} {revision}: there, the crash is {got.replace('_', ' ')}, and not {expected}"
+            raise UsageError(message, fix="give another revision")
 
 
 def _no_way(good: str, bad: str, parts: str) -> UsageError:
     """Return the error for revisions on two branches whose common ancestor already has the crash."""
     message = f"--good {good} is not before --bad {bad}: their common ancestor {parts[:12]} already has the crash"
     return UsageError(message, fix="give a --good revision before that ancestor")
-
-
-def _require_status(got: Got, expected: Got, revision: str, option: str, why: str, *, has_build: bool) -> None:
-    if why:
-        fix = "" if has_build else ", or --build COMMAND if the agent needs files that Git does not track"
-        raise UsageError(f"{option} {revision} cannot run: {why}", fix=f"give another revision{fix}")
-    if got != expected:
-        message = f"{option} {revision}: there, the crash is {got.replace('_', ' ')}, and not {expected}"
-        raise UsageError(message, fix="give another revision")
 
 
 def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, str]:
