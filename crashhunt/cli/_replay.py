@@ -31,6 +31,7 @@ from crashhunt.cli._trust import add_trust, run_trusted
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import numpy as np
@@ -269,6 +270,19 @@ def add_replay(commands: Commands) -> None:
         "--expect", choices=("reproduced", "fixed"), default="reproduced",
         help="the expected verdict, for which the exit code is 0; default: reproduced",
     )  # fmt: skip
+    _add_inspection(replay)
+    add_film_options(replay)
+    add_trust(replay)
+    replay.add_argument(
+        "--force", action="store_true",
+        help="replay even if the snapshot is damaged; needs --trust, or --from-log, which runs no code of the snapshot",
+    )  # fmt: skip
+    add_json(replay)
+    replay.set_defaults(command=_replay)
+
+
+def _add_inspection(replay: argparse.ArgumentParser) -> None:
+    """Add the options that stop a replay, and show what is inside."""
     look = replay.add_argument_group(
         "to look into it",
         "With these options, the agent runs attached to the terminal, so breakpoints in its code work.",
@@ -301,14 +315,6 @@ def add_replay(commands: Commands) -> None:
         help="with --gui: wall time between two steps, in s; default: the length of a simulation step, so that the "
         "replay runs in real time",
     )  # fmt: skip
-    add_film_options(replay)
-    add_trust(replay)
-    replay.add_argument(
-        "--force", action="store_true",
-        help="replay even if the snapshot is damaged; needs --trust, or --from-log, which runs no code of the snapshot",
-    )  # fmt: skip
-    add_json(replay)
-    replay.set_defaults(command=_replay)
 
 
 def _replay(options: Options, _words: list[str]) -> int:
