@@ -41,17 +41,12 @@ class ExecutorContract:
     @pytest.fixture
     def executor(self, make: Make, tmp_path: Path) -> Iterator[Executor]:
         """Return an executor with two workers and a time limit of two seconds."""
-        scratch = tmp_path / "scratch"
-        scratch.mkdir()
-        scenario = Scenario(
-            simulator="toy",
-            folder=tmp_path,
-            agents={"ego": AgentSetup()},
-            arguments={name: ArgumentSetup(default=0) for name in _SWITCHES},
-        )
-        made = make(WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=2.0), 2)
-        yield made
-        made.close()
+        yield from _made(make, tmp_path, timeout_s=2.0)
+
+    @pytest.fixture
+    def patient(self, make: Make, tmp_path: Path) -> Iterator[Executor]:
+        """Return an executor with two workers, in which a trial that hangs would outlive every test."""
+        yield from _made(make, tmp_path, timeout_s=3600.0)
 
     def _spec(self, number: int, **arguments: Value) -> TrialSpec:
         return TrialSpec(
@@ -103,18 +98,16 @@ class ExecutorContract:
         assert {result.outcome for result in good.values()} == {Outcome.SURVIVED}
         assert all(result.steps == 30 and result.digest for result in good.values())
 
-    def test_cancelled_trials_do_not_come_back(self, executor: Executor) -> None:
+    def test_cancelled_trials_do_not_come_back(self, patient: Executor) -> None:
         """Cancelled trials block no other trial, even if they hang. Trials that are submitted later run."""
-        executor.submit(self._spec(0))
-        self._collect(executor, 1)
+        patient.submit(self._spec(0))
+        self._collect(patient, 1)
         for number in range(1, 6):
-            executor.submit(self._spec(number, hang_at_step=5))
-        began = time.monotonic()
-        list(executor.completed(0.3))
-        executor.cancel(above=0)
-        assert time.monotonic() - began < 1.5
-        executor.submit(self._spec(9))
-        assert set(self._collect(executor, 1)) == {9}
+            patient.submit(self._spec(number, hang_at_step=5))
+        list(patient.completed(0.3))
+        patient.cancel(above=0)
+        patient.submit(self._spec(9))
+        assert set(self._collect(patient, 1)) == {9}
 
     def test_it_states_how_much_it_runs_and_where_that_is(self, executor: Executor) -> None:
         """The progress of running trials is reported or unknown; trials that were not submitted have no progress."""
@@ -147,11 +140,24 @@ class ExecutorContract:
         scratch = tmp_path / "scratch"
         assert Recording(read_black_box(scratch_of(scratch, 1) / layout.BLACK_BOX)).steps == found[1].steps
 
-    def test_closing_twice_is_fine(self, executor: Executor) -> None:
-        """Closing ends every process at once, regardless of what it is doing."""
-        executor.submit(self._spec(0, hang_at_step=5))
-        list(executor.completed(0.5))
-        began = time.monotonic()
-        executor.close()
-        executor.close()
-        assert time.monotonic() - began < 5
+    def test_closing_twice_is_fine(self, patient: Executor) -> None:
+        """Closing ends every process, regardless of what it is doing."""
+        patient.submit(self._spec(0, hang_at_step=5))
+        list(patient.completed(0.5))
+        patient.close()
+        patient.close()
+
+
+def _made(make: Make, folder: Path, *, timeout_s: float) -> Iterator[Executor]:
+    scratch = folder / "scratch"
+    scratch.mkdir()
+    scenario = Scenario(
+        simulator="toy",
+        folder=folder,
+        agents={"ego": AgentSetup()},
+        arguments={name: ArgumentSetup(default=0) for name in _SWITCHES},
+    )
+    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=timeout_s)
+    made = make(settings, 2)
+    yield made
+    made.close()

@@ -446,7 +446,7 @@ def test_executor_contract_finds_what_is_broken(executor, fails, boxes, tmp_path
 
     def fixtures():
         made.append(executor())
-        return {"executor": made[-1], "tmp_path": tmp_path}
+        return {"executor": made[-1], "patient": made[-1], "tmp_path": tmp_path}
 
     assert failing(ExecutorContract, fixtures) == fails
     if executor is Runs:
@@ -457,7 +457,7 @@ def test_executor_contract_finds_what_is_broken(executor, fails, boxes, tmp_path
 def test_executor_contract_waits_until_trials_run_before_it_stops_them(tmp_path, boxes):
     for name, stop in ((CANCELLED, "cancel"), ("test_closing_twice_is_fine", "close"), (STATES, "cancel")):
         executor = Runs()
-        run_test(ExecutorContract, name, {"executor": executor, "tmp_path": tmp_path})
+        run_test(ExecutorContract, name, {"executor": executor, "patient": executor})
         order = [call[0] for call in executor.calls]
         stopped = order.index(stop)
         begun = max(n for n, kind in enumerate(order[:stopped]) if kind == "submit")
@@ -466,17 +466,18 @@ def test_executor_contract_waits_until_trials_run_before_it_stops_them(tmp_path,
     assert Counter(call[0] for call in executor.calls)["where"] > 2
 
 
-def test_executor_of_the_contract_has_room_for_two_and_is_closed(tmp_path):
+@pytest.mark.parametrize(("fixture", "timeout_s"), [("executor", 2.0), ("patient", 3600.0)])
+def test_executor_of_the_contract_has_room_for_two_and_is_closed(fixture, timeout_s, tmp_path):
     made = []
 
     def make(settings, parallel):
         assert settings.scratch.is_dir()
-        assert parallel == 2
+        assert (parallel, settings.timeout_s) == (2, timeout_s)
         assert {setup.default for setup in settings.scenario.arguments.values()} == {0}  # none fails unasked
         made.append(Runs())
         return made[-1]
 
-    given = ExecutorContract.executor._get_wrapped_function()(ExecutorContract(), make, tmp_path)
+    given = getattr(ExecutorContract, fixture)._get_wrapped_function()(ExecutorContract(), make, tmp_path)
     assert next(given) is made[0]
     assert made[0].calls == []
     assert list(given) == []
