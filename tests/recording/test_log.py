@@ -13,17 +13,13 @@ from pathlib import Path
 import pytest
 from conftest import examples
 from episodes import Episode, episodes, record
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import HealthCheck, given, settings, strategies as st
 from mcap.reader import SeekingReader, make_reader
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
 from crashhunt.errors import BundleError
-from crashhunt.recording import _foxglove, _log, foxglove_layout, read_log, write_log
+from crashhunt.recording import _foxglove, _log, read_log, write_log
 from crashhunt.recording._foxglove import messages_of
 from crashhunt.trial import Collision, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Lane
@@ -129,52 +125,6 @@ def test_what_is_no_log_is_refused(tmp_path):
             writer.finish()
         with pytest.raises(BundleError, match=says):
             read_log(path)
-
-
-def test_the_views_say_what_the_recording_states(tmp_path):
-    """Every view message is parsed with Foxglove's own classes and compared with the scene it shows."""
-    recording = record(Episode(["ego", "odd name/§ #1"], 20, 4), tmp_path / "box")
-    write_log(tmp_path / "log.mcap", recording, lanes=LANES, crash=CRASH)
-    kinds = {
-        "foxglove.SceneUpdate": SceneUpdate,
-        "foxglove.FrameTransforms": FrameTransforms,
-        "foxglove.PoseInFrame": PoseInFrame,
-        "foxglove.Log": Log,
-    }
-    shown: dict[str, list] = {}
-    with (tmp_path / "log.mcap").open("rb") as file:
-        last = -1
-        for schema, channel, message in make_reader(file).iter_messages():
-            assert message.log_time == message.publish_time
-            assert message.log_time >= last
-            last = message.log_time
-            if schema.name in kinds:
-                assert schema.encoding == channel.message_encoding == "protobuf"
-                shown.setdefault(channel.topic, []).append(
-                    (message.log_time, kinds[schema.name].FromString(message.data))
-                )
-    assert set(shown) == {"/map", "/scene/actors", "/tf", "/ego/pose", "/log", "/scene/crash"}
-    scenes = recording.scenes()
-    assert len(shown["/scene/actors"]) == len(shown["/tf"]) == len(scenes) == 21
-    for scene, (time_ns, update), (_, transforms) in zip(scenes, shown["/scene/actors"], shown["/tf"], strict=True):
-        assert time_ns == round(scene.time_s * 1e9)
-        assert [entity.id for entity in update.entities] == [actor.id for actor in scene.roster.actors]
-        for entity, center, actor in zip(update.entities, scene.centers, scene.roster.actors, strict=True):
-            (cube,) = entity.cubes
-            assert (cube.pose.position.x, cube.pose.position.y) == tuple(center)
-            assert (cube.size.x, cube.size.y) == (actor.length, actor.width)
-            assert entity.timestamp.ToNanoseconds() == time_ns
-            assert 1e8 < entity.lifetime.ToNanoseconds() < 1.5e8
-        assert [t.child_frame_id for t in transforms.transforms] == list(recording.agents)
-        row = scene.roster.index["ego"]
-        assert transforms.transforms[0].translation.x == scene.centers[row, 0]
-    ((_, lanes),) = shown["/map"]
-    assert len(lanes.entities[0].lines) == 2  # both borders of the near lane, nothing of the far one
-    ((_, line),) = shown["/log"]
-    assert "ego drove into car 0" in line.message
-    layout = foxglove_layout(recording)
-    assert layout["configById"]["3D!scene"]["followTf"] == "ego"
-    assert set(layout["configById"]["3D!scene"]["topics"]) <= set(shown)
 
 
 def test_a_full_disk_leaves_nothing_behind(tmp_path):

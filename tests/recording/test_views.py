@@ -89,6 +89,7 @@ def shown(tmp_path):
         messages = {}
         with (tmp_path / "log.mcap").open("rb") as file:
             for _, channel, message in make_reader(file).iter_messages():
+                assert message.log_time == message.publish_time
                 if channel.topic in KINDS:
                     found = KINDS[channel.topic].FromString(message.data)
                     messages.setdefault(channel.topic, []).append((message.log_time, found))

@@ -34,6 +34,13 @@ def test_curves_have_the_colours_that_colour_blind_people_can_tell_apart():
     assert found == sorted(found, reverse=True)  # the higher a value, the smaller its row
 
 
+def test_long_names_of_curves_have_a_row_each_above_the_axes():
+    names = ({f"{name}{more}": [0, 1] for name in ("speed", "limit")} for more in ("", "x" * 40))
+    frames = [(Curve(each, low=-9, high=9).draw() == (93, 107, 125)).all(axis=2).sum(axis=1) > 150 for each in names]
+    first, second = (np.flatnonzero(frame)[0] for frame in frames)
+    assert second == first + 13
+
+
 def test_a_distribution_over_actions_is_up_to_one_and_a_normal_one_has_its_peak_at_the_mean():
     picture = ActionDistribution([0.25, 0.75]).draw()
     heights = where(picture, BLUE).sum(axis=0)

@@ -156,8 +156,10 @@ def test_where_it_fails_nothing_is_left_and_the_map_is_named(made_up, tmp_path):
     made_up.error = None
     make_scenario(GRID, MapOptions(picture=False), tmp_path / "place")  # an empty folder may be there
     (tmp_path / "file").write_text("")
-    with pytest.raises(HuntDirectoryError, match="is not a folder"):
-        make_scenario(GRID, MapOptions(), tmp_path / "file")
+    (tmp_path / "link").symlink_to("nowhere")
+    for name in ("file", "link"):
+        with pytest.raises(HuntDirectoryError, match="is not a folder"):
+            make_scenario(GRID, MapOptions(), tmp_path / name)
     with pytest.raises(UsageError, match="--bbox cannot be used with --grid"):
         make_scenario(GRID, MapOptions(bbox=(1, 2, 3, 4)), tmp_path / "other")
     with pytest.raises(UsageError, match="--lefthand cannot be used with --net"):

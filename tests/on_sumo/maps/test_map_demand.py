@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import pytest
 
-from crashhunt.base.errors import HuntDirectoryError, ScenarioError
+from crashhunt.base.errors import ScenarioError
 from crashhunt.sumo.maps import MapSource, _make
 from crashhunt.sumo.maps._folder import arguments_of
-from crashhunt.sumo.maps._make import MadeScenario, PlainTrial, _busiest, _check_directory, _thin_traffic
+from crashhunt.sumo.maps._make import MadeScenario, PlainTrial, _busiest, _thin_traffic
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
 from crashhunt.sumo.maps._traffic import (
     RUN_S,
@@ -192,17 +192,6 @@ def test_busiest_roads_are_of_different_streets_by_vehicles_per_hour():
     assert len(_busiest(made(network=many, busy=busy))) == _make._MAX_LISTED_ROADS
 
 
-def test_picture_is_of_the_simulated_hours(monkeypatch, tmp_path):
-    drawn = []
-    monkeypatch.setattr(_make, "draw_map", lambda *given, **more: drawn.append((given, more)))
-    _make._draw(made(), tmp_path)
-    (((given_network, vehicles, path), more),) = drawn
-    assert (given_network, vehicles, path.parent) == (TOWN, RUN.edge_vehicles, tmp_path)
-    assert more["hours"] == pytest.approx(RUN_S / 3600)
-    assert more["title"].endswith("traffic at demand 2")
-    assert more["busiest"] == _busiest(made())
-
-
 def test_times_of_a_made_scenario_follow_its_routes():
     def with_routes(*free_s, ego=("r0",)):
         ways = tuple(
@@ -258,16 +247,3 @@ def test_thin_traffic_is_noted_up_to_a_density():
     assert "because --demand ends at 0.5" in limited
     (other,) = _thin_traffic(replace(RUN, demand=1.0, running=10), 15 / least, 2.0)
     assert "--bbox" in other
-
-
-def test_folder_of_a_made_scenario_is_new_or_empty(tmp_path):
-    _check_directory(tmp_path / "new")
-    (tmp_path / "empty").mkdir()
-    _check_directory(tmp_path / "empty")
-    (tmp_path / "empty/file").touch()
-    for place, what in (("empty", "exists and is not empty"), ("empty/file", "exists and is not a folder")):
-        with pytest.raises(HuntDirectoryError, match=what):
-            _check_directory(tmp_path / place)
-    (tmp_path / "link").symlink_to("nowhere")
-    with pytest.raises(HuntDirectoryError, match="exists and is not a folder"):
-        _check_directory(tmp_path / "link")

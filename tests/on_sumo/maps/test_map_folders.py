@@ -20,7 +20,7 @@ from crashhunt.scenario import scenario_from_dict, shipped_folder
 from crashhunt.sumo.maps import MapSource, read_network
 from crashhunt.sumo.maps._convert import ConvertOptions, convert
 from crashhunt.sumo.maps._folder import agent_module, arguments_of, next_commands, readme, scenario_toml, workflow
-from crashhunt.sumo.maps._picture import draw_map, drawable
+from crashhunt.sumo.maps._picture import drawable
 from crashhunt.sumo.maps._road_network import Edge, NetworkLane, RoadNetwork
 from crashhunt.sumo.maps._tools import Tools
 from crashhunt.sumo.maps._traffic import Demand, Route, _ego_routes, route_file
@@ -47,17 +47,6 @@ def demand(*routes, per_hour=600.0, walks=()):
 
 
 # The network.
-
-
-def test_shipped_network_is_read():
-    found = read_network(shipped_folder() / "intersection" / "intersection.net.xml")
-    assert set(found.edges) == {
-        f"{way}-{side}" for way in ("from", "to") for side in ("north", "south", "east", "west")
-    }
-    assert all(edge.admits("passenger") for edge in found.edges.values())
-    assert sum(found.junctions.values()) >= 1
-    assert not found.left_hand
-    assert not found.crossings
 
 
 NET = """<net lefthand="true">
@@ -129,11 +118,6 @@ def test_full_disk_under_a_program_is_reported(tools, tmp_path, monkeypatch):
     assert "TMPDIR" in caught.value.fix
 
 
-def test_rates_add_up_and_follow_weights():
-    found = {one.id: rate for one, rate in demand(route("a", "x", weight=3), route("b", "y")).rates()}
-    assert found == {"a": pytest.approx(450.0), "b": pytest.approx(150.0)}
-
-
 def test_agent_begins_at_different_places_first():
     routes = [route("a", "x", "y", weight=9), route("b", "x", "z", weight=8), route("c", "w", weight=1)]
     assert _ego_routes(routes) == ("a", "c", "b")
@@ -177,13 +161,6 @@ def test_odd_names_of_roads_survive_the_template():
     assert next(filled(text).iter("route")).get("edges") == odd
 
 
-def test_persons_begin_one_after_another():
-    text = route_file(demand(route("a", "x"), walks=(("x", "y"), ("y", "x"))), network(x=[lane()]), bicycles=False)
-    begins = [float(flow.get("begin")) for flow in filled(text, persons_per_path=30).iter("personFlow")]
-    assert begins == sorted(begins)
-    assert len(set(begins)) == 2
-
-
 # The texts.
 
 
@@ -200,15 +177,6 @@ def test_scenario_of_any_title_is_valid(title, agent):
     for name, argument in found.scenario_arguments().items():
         if argument.distribution is not None:
             assert argument.distribution.contains(argument.default), name
-
-
-@pytest.mark.parametrize(("scales", "default"), [((0.2, 1.5), 1.0), ((2.0, 3.0), 2.0), ((0.1, 0.4), 0.4)])
-def test_usual_demand_is_within_its_range(scales, default):
-    found = {one.name: one for one in arguments_of(demand(route("a", "x")), scales, bicycles=False)}
-    assert found["demand"].default == default
-    assert "cyclists_per_100_cars" not in found
-    assert "persons_per_path" not in found
-    assert found["ego_route"].range == ""  # there is only one
 
 
 def driver(**arguments):
@@ -281,23 +249,6 @@ def test_commands_for_a_folder_with_odd_characters_are_quoted():
 
 
 # The picture.
-
-
-def test_a_busy_road_is_drawn_over_a_quiet_one_that_it_crosses(tmp_path):
-    image_of = pytest.importorskip("PIL.Image")
-    across = NetworkLane(length_m=100.0, speed_mps=10.0, allowed=None, disallowed=frozenset(),
-                         shape=((50.0, -50.0), (50.0, 50.0)))  # fmt: skip
-    middles = []
-    for names in (("along", "across"), ("across", "along")):
-        roads = {"along": [lane()], "across": [across]}
-        found = network(**{name: roads[name] for name in names})
-        draw_map(found, {"along": 90.0, "across": 3.0}, tmp_path / "m.png", title="t", hours=0.1, busiest=[])
-        with image_of.open(tmp_path / "m.png") as image:
-            pixels = np.asarray(image.convert("RGB")).astype(int)
-        red = (pixels[..., 0] > 180) & (pixels[..., 1] < 80) & (pixels[..., 2] < 80)
-        rows, columns = np.nonzero(red[60:-60])
-        middles.append(red[60 + int(np.median(rows)), int(np.median(columns))])
-    assert middles == [True, True]
 
 
 @pytest.mark.parametrize(

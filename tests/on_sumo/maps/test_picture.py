@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from crashhunt.sumo.maps import _picture
 from crashhunt.sumo.maps._picture import (
     _GROUND,
     _MARGIN,
@@ -73,16 +72,6 @@ def test_colors_go_from_little_traffic_to_the_most():
     assert _color(0.25) == tuple(round((a + b) / 2) for a, b in zip(BLUE, ORANGE, strict=True))
 
 
-def test_busiest_roads_are_labelled_at_their_middle(pixels):
-    edges = [road("long", (0.0, 0.0), (1000.0, 0.0)), road("north", (0.0, 1000.0), (1000.0, 1000.0))]
-    plain = pixels(edges, {"long": 9.0})
-    assert plain(505.0, 0.0) != (255, 255, 255)
-    labelled = pixels(edges, {"long": 9.0}, busiest=[("long", 900.0), ("north", 1.0)])
-    white = [x for x in range(500, 640) if labelled(float(x), 0.0) == (255, 255, 255)]
-    assert len(white) > 10
-    assert min(white) < 515
-
-
 FLOWS = {
     "demand": 100.0, "wanted": 100, "entered": 100, "arrived": 80, "running": 20, "halting": 2, "teleports": 0,
     "collisions": 0, "mean_speed_mps": 9.0, "persons": 0,
@@ -110,15 +99,6 @@ FLOWS = {
 )  # fmt: skip
 def test_traffic_that_does_not_flow_has_a_reason(given, jam):
     assert PlainRun(**FLOWS | given).jam == jam
-
-
-def test_legend_has_the_most_vehicles_of_a_road_per_hour(tmp_path, monkeypatch):
-    pytest.importorskip("PIL")
-    seen = []
-    monkeypatch.setattr(_picture, "_draw_ramp", lambda draw, width, most, letters, ink: seen.append(most))
-    found = RoadNetwork({"a": road("a", (0.0, 0.0), (1000.0, 0.0))})
-    _picture.draw_map(found, {"a": 90.0}, tmp_path / "m.png", title="", hours=0.5, busiest=[])
-    assert seen == [180.0]
 
 
 class Drawing:
