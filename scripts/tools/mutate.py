@@ -107,7 +107,7 @@ _TESTS_ELSEWHERE = {
         "cli/test_answers.py",
         "training/test_held_out_traffics.py",
     ),
-    "cli/_status.py": ("e2e/test_manage.py",),
+    "cli/_status.py": ("cli/test_status.py",),
     "cli/_suite.py": ("e2e/test_suite.py",),
     "cli/_trials.py": (
         "cli/test_answers.py",
@@ -153,7 +153,7 @@ _TESTS_ELSEWHERE = {
     "hunts/_hunt_file_check.py": ("e2e/test_check.py",),
     "hunts/_salvage.py": ("e2e/test_check.py",),
     "results/_found_crashes.py": ("hunts/test_whole_hunts.py",),
-    "hunts/_fork_results.py": ("hunts/test_whole_hunts.py", "e2e/test_branches.py"),
+    "hunts/_fork_results.py": ("hunts/test_from_the_start.py", "hunts/test_whole_hunts.py"),
     "hunts/_hunt.py": (
         "hunts/test_rare_hunts.py",
         "hunts/test_states_and_reports.py",

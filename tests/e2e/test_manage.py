@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 
 from conftest import keeps_going
-
-KEEP = ("--scenario", "toy", "--seed", "4", "--keep-going")
 
 
 def rows(shell, hunt: str, *words: str) -> list[dict]:
@@ -45,26 +42,3 @@ def test_tables_of_trials(toy, made_once):
     ):
         assert says in toy.crashhunt("trials", "h", *words, expect=2).err
     assert not list(toy.folder.glob(".*.part"))
-
-
-def test_the_shortest_few_of_a_kind_are_kept(toy, made_once):
-    made_once(keeps_going, toy)
-    before, folder = rows(toy, "h"), toy.folder / "h" / "crashes"
-    crashes = sorted((row for row in before if row["outcome"] == "collision"), key=lambda row: row["steps"])
-    assert len(crashes) == len(list(folder.iterdir())) > 2
-    shutil.copytree(toy.folder / "h", toy.folder / "k")
-    folder = toy.folder / "k" / "crashes"
-    told = toy.crashhunt("run", "k", "1", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "2")
-    assert sorted(path.name for path in folder.iterdir()) == sorted(
-        f"{row['number']:06d}-collision" for row in crashes[:2]
-    )
-    assert f"{len(crashes)} crashes of 1 type" in told.out
-    assert rows(toy, "k") == before
-    (group,) = toy.crashhunt("crashes", "k", "--json").json["groups"]
-    assert (group["count"], len(group["members"])) == (len(crashes), 2)
-    assert "2 crashes are intact" in toy.crashhunt("check", "k").out
-    told = toy.crashhunt("run", "k", "1", "12", "99", "--scenario", "toy", "--seed", "5", *KEEP[-1:], "--keep", "1")
-    assert len(list(folder.iterdir())) == 1
-    assert f"{len(crashes)} crashes of 1 type" in told.out
-    shutil.rmtree(next(folder.iterdir()))  # one that is missing is not one that was given up
-    assert "crashed, and its bundle is missing" in toy.crashhunt("check", "k", expect=1).out

@@ -246,29 +246,20 @@ def test_a_machine_is_lost_with_all_its_parts(begin):
     assert sorted(left) == [*range(10)]
 
 
-def test_an_actor_whose_cpus_another_got_is_taken_back(begin):
-    """Two hunts that begin at once both see the same CPUs free; whoever is late says so, or waits for other nodes."""
+@pytest.mark.parametrize(("before_s", "hunts", "soon_s"), [(2, 0, 40), (3, 2, 5)])
+def test_an_actor_whose_cpus_another_got_is_taken_back(begin, before_s, hunts, soon_s):
+    """Two hunts that begin at once both see the same CPUs free; whoever is late says so, or waits for other nodes.
+
+    That another hunt has them is known in ten seconds on an idle machine, some of which go by until it has begun.
+    """
     _, cluster, after = begin(a=2)
     cluster.late = True
-    after(2)
-    cluster.others["a"] = 2
+    after(before_s)
+    cluster.others["a"], cluster.hunts["a"] = 2, hunts
     with pytest.raises(
         UsageError, match="cannot run trials: none of its 2 CPUs is free; wait until other jobs are done"
     ):
-        after(40)
-    assert not any(actor.alive for actor in cluster.actors)
-
-
-def test_the_one_that_loses_a_race_of_two_hunts_is_reported_soon(begin):
-    """In ten seconds on an idle machine, of which some go by until the other hunt has begun."""
-    _, cluster, after = begin(a=2)
-    cluster.late = True
-    after(3)
-    cluster.others["a"] = cluster.hunts["a"] = 2
-    with pytest.raises(
-        UsageError, match="cannot run trials: none of its 2 CPUs is free; wait until other jobs are done"
-    ):
-        after(5)
+        after(soon_s)
     assert not any(actor.alive for actor in cluster.actors)
 
 

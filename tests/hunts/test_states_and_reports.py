@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import socket
 import sqlite3
 import time
 from contextlib import closing
@@ -24,7 +22,7 @@ from crashhunt.hunts._progress import Progress
 from crashhunt.ledger import Ledger
 from crashhunt.plans import RunSettings
 from crashhunt.results import find_hunts, find_searches, hunt_state, is_hunt, load
-from crashhunt.results._hunt_state import draws_independently, ledger_owner, sums_of_branches, sums_of_probes
+from crashhunt.results._hunt_state import draws_independently, sums_of_branches, sums_of_probes
 from crashhunt.statistics import CountingRule, RateWatch
 from crashhunt.trial import KILLED, Branches, Disturbance, Failure, Outcome, Stress, TrialResult, TrialSpec
 
@@ -70,20 +68,6 @@ def test_how_a_hunt_ended_is_its_state(hunt, said, state):
     shutil.rmtree(hunt / "crashes")
     found = hunt_state(hunt)
     assert (found.state, found.crashes, found.crashes_saved) == (state, 2, 0)  # counts are over all trials
-
-
-def test_a_hunt_whose_process_is_there_runs(hunt):
-    me = ledger_owner()
-    assert (me["host"], me["pid"]) == (socket.gethostname(), os.getpid())
-    assert me["started"] > 0
-    began = time.time() - 10
-    note(hunt, state="running", owner=me, began=began, done_before=2, planned=8)
-    found = hunt_state(hunt)
-    assert (found.state, found.owner_alive) == ("running", True)
-    assert found.rate_per_s == pytest.approx(2 / 10, rel=0.2)
-    assert found.seconds_left == pytest.approx(4 / found.rate_per_s, rel=0.05)
-    note(hunt, owner={**me, "pid": 2**22 + 5})
-    assert hunt_state(hunt).state == "killed"
 
 
 def test_what_not_every_hunt_has_is_in_its_json_only_where_it_has_it(hunt):

@@ -139,13 +139,6 @@ def test_owner_in_another_container_of_the_same_host_name_is_judged_by_its_heart
         assert not _hunt_state._is_alive(gone, NOW)
 
 
-def test_folders_of_runs_are_in_the_order_of_their_numbers():
-    names = ["x/b3", "x/10", "x/a", "x/2", "x/1"]
-    assert sorted(map(Path, names), key=_hunt_state._ordered_states) == [
-        Path("x") / name for name in ("1", "2", "10", "a", "b3")
-    ]
-
-
 def test_copies_of_a_hunt_are_those_of_its_settings():
     def of(**wanted):
         return copies_to_come(SimpleNamespace(**{"probe": "", "branch": False, "rare": False} | wanted))
