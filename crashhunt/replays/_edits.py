@@ -229,22 +229,13 @@ def edited_spec(
     Raises:
         ArgumentError: an argument does not exist, or a range is given instead of one value.
     """
-    agents: list[str] = []
-    others: list[str] = []
-    values: Values = {}
     before, after = _specs(original), _specs(settings)
-    for key in sorted(before.keys() | after.keys()):
-        spec = after.get(key)
-        if spec is not None and spec != before.get(key):
-            values[key] = _constant(spec.spec, spec, f"hunt.toml, {_name(key)}")
-    for agent, chosen in settings.agents.items():
-        if agent in original.agents and chosen.agent != original.agents[agent].agent:
-            agents.append(f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}")
-    for name in ("max_steps", "crash_on", "events", "oracles"):
-        before_it, now = getattr(original, name), getattr(settings, name)
-        if before_it != now:
-            longer = name == "max_steps" and now > before_it  # which leaves nothing out
-            (agents if longer else others).append(f"{name} was {_plain(before_it)} and is {_plain(now)}")
+    values: Values = {
+        key: _constant(spec.spec, spec, f"hunt.toml, {_name(key)}")
+        for key, spec in sorted(after.items())
+        if spec != before.get(key)
+    }
+    agents, others = _changes_of_settings(original, settings)
     vehicles = tuple(recorded.arguments) or tuple(settings.agents)
     disturbances, said, unheard = with_other_words(recorded.disturbances, original.disturb, settings.disturb, vehicles)
     others += said
@@ -252,26 +243,11 @@ def edited_spec(
         if is_about_disturbances(name) and name not in recorded.scenario_arguments:
             disturbances, said = edited_disturbances(disturbances, name, text, vehicles)
             others += said
-            continue
-        key = _find(name, recorded, settings, code)
-        values[key] = _constant(text, after.get(key), f"--set {name}")
-    arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
-    scenario_arguments = dict(recorded.scenario_arguments)
-    for (agent, name), value in values.items():
-        target = arguments.setdefault(agent, {}) if agent else scenario_arguments
-        if name not in target or target[name] != value:
-            (agents if agent else others).append(
-                f"{_name((agent, name))} was {target.get(name, '(not there)')} and is {value}"
-            )
-            target[name] = value
+        else:
+            key = _find(name, recorded, settings, code)
+            values[key] = _constant(text, after.get(key), f"--set {name}")
     max_steps = settings.max_steps if settings.max_steps != original.max_steps else recorded.max_steps
-    trial = replace(
-        recorded,
-        arguments=arguments,
-        scenario_arguments=scenario_arguments,
-        max_steps=max_steps,
-        disturbances=disturbances,
-    )
+    trial = replace(_with_values(recorded, values, agents, others), max_steps=max_steps, disturbances=disturbances)
     kept = [
         f"{name} was {_plain(was)} and is {_plain(now)} in hunt.toml; a replay keeps that of the recorded trial"
         for name in ("seed", "scenario")
@@ -282,6 +258,35 @@ def edited_spec(
         fix = f"give a step up to {max_steps}"
         raise ArgumentError(f"{NAME}: {late.what}@{late.step} cannot happen: the trial has {max_steps} steps", fix=fix)
     return trial, Edits(tuple(agents), tuple(others), (*kept, *unheard))
+
+
+def _changes_of_settings(original: HuntSettings, settings: HuntSettings) -> tuple[list[str], list[str]]:
+    """Return the changes to agents and limits in ``hunt.toml`` as texts, and those to other settings of its trials."""
+    agents = [
+        f"agents.{agent}.agent was {original.agents[agent].agent} and is {chosen.agent}"
+        for agent, chosen in settings.agents.items()
+        if agent in original.agents and chosen.agent != original.agents[agent].agent
+    ]
+    others: list[str] = []
+    for name in ("max_steps", "crash_on", "events", "oracles"):
+        was, now = getattr(original, name), getattr(settings, name)
+        if was != now:
+            longer = name == "max_steps" and now > was  # which leaves nothing out
+            (agents if longer else others).append(f"{name} was {_plain(was)} and is {_plain(now)}")
+    return agents, others
+
+
+def _with_values(recorded: TrialSpec, values: Values, agents: list[str], others: list[str]) -> TrialSpec:
+    """Return a trial with other values of arguments, and add each change to the texts about agents or other changes."""
+    arguments = {agent: dict(given) for agent, given in recorded.arguments.items()}
+    scenario_arguments = dict(recorded.scenario_arguments)
+    for (agent, name), value in values.items():
+        target = arguments.setdefault(agent, {}) if agent else scenario_arguments
+        if name not in target or target[name] != value:
+            was = target.get(name, "(not there)")
+            (agents if agent else others).append(f"{_name((agent, name))} was {was} and is {value}")
+            target[name] = value
+    return replace(recorded, arguments=arguments, scenario_arguments=scenario_arguments)
 
 
 def _specs(settings: HuntSettings) -> dict[tuple[str, str], ArgumentSpec]:

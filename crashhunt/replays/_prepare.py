@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from crashhunt.crashes import Bundle
     from crashhunt.plans import HuntSettings
     from crashhunt.recording import Recording
+    from crashhunt.replays._edits import Edits
     from crashhunt.scenario import Scenario
     from crashhunt.trial import TrialSpec, Value
 
@@ -163,20 +164,10 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     runs = None if code == "log" or not trusted else snapshot.code if code == "snapshot" else ()
     spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
     warnings += edits.ignored
-    if not options.scenario and (odd := _unsupported_kind(scenario, spec)):
-        able = ", ".join((*(scenario.backend.disturbances or ()), *SENSOR_KINDS))
-        raise UsageError(
-            f"{scenario.backend.title} does not support the disturbance {odd!r}", fix=f"it supports {able}"
-        )
+    if not options.scenario:
+        _refuse_unsupported(scenario, spec)
     if code == "log":
-        if edits.all:
-            raise UsageError(
-                f"the recorded actions cannot be repeated, because the trial was changed: {edits.all[0]}",
-                fix="run the agent's code in the changed trial, with --code snapshot",
-            )
-        if options.scenario:
-            message = f"recorded actions belong to the recorded scenario, not to {options.scenario!r}"
-            raise UsageError(message, fix="omit --scenario or --from-log")
+        _refuse_changed(edits, options.scenario)
         if not trusted:
             refuse_side_effects(scenario, settings, spec.scenario_arguments)
             if not landlock_version():
@@ -251,10 +242,7 @@ def _in_scenario(
     agents = {ids[agent]: chosen for agent, chosen in settings.agents.items()}
     shared = {key: value for key, value in spec.scenario_arguments.items() if key in other.arguments}
     there = other.backend.step_length_s(other)
-    odd = _unsupported_kind(other, spec)
-    if odd:
-        message = f"--scenario {name!r}: {other.backend.title} does not support the disturbance {odd!r}"
-        raise UsageError(message, fix="replay with --set disturbances=none as well")
+    _refuse_unsupported(other, spec, chosen=name)
     return with_settings(other, replace(settings, agents=agents)), replace(
         spec,
         arguments={ids[agent]: values for agent, values in spec.arguments.items()},
@@ -269,11 +257,27 @@ def _in_scenario(
     )
 
 
-def _unsupported_kind(scenario: Scenario, spec: TrialSpec) -> str:
-    """Return the first kind of disturbance that the scenario's simulator does not support; empty if there is none."""
+def _refuse_unsupported(scenario: Scenario, spec: TrialSpec, *, chosen: str = "") -> None:
+    """Refuse a trial with a disturbance that the simulator does not support, in its own or a ``chosen`` scenario."""
     able = scenario.backend.disturbances
-    odd = (one.what for one in spec.disturbances if able is not None and one.what not in (*able, *SENSOR_KINDS))
-    return next(odd, "")
+    for one in spec.disturbances:
+        if able is not None and one.what not in (*able, *SENSOR_KINDS):
+            where = f"--scenario {chosen!r}: " if chosen else ""
+            fix = f"it supports {', '.join((*able, *SENSOR_KINDS))}"
+            fix = "replay with --set disturbances=none as well" if chosen else fix
+            raise UsageError(f"{where}{scenario.backend.title} does not support the disturbance {one.what!r}", fix=fix)
+
+
+def _refuse_changed(edits: Edits, scenario: str) -> None:
+    """Refuse a changed trial or another scenario, for which the recorded actions are not meant."""
+    if edits.all:
+        raise UsageError(
+            f"the recorded actions cannot be repeated, because the trial was changed: {edits.all[0]}",
+            fix="run the agent's code in the changed trial, with --code snapshot",
+        )
+    if scenario:
+        message = f"recorded actions belong to the recorded scenario, not to {scenario!r}"
+        raise UsageError(message, fix="omit --scenario or --from-log")
 
 
 def is_current_code(rerun: Rerun) -> bool:
