@@ -303,21 +303,21 @@ class SimulatorContract:
             for agent in agents:
                 simulator.actions[agent].space.seed(3)
             held = {name: simulator.actions[name].encode(simulator.actions[name].space.sample()) for name in agents}
-            erring = {}
+            found = {}
             for cell in CELLS:
                 planned = Disturbance(step=1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0])
                 vehicle = simulator.resolve_target(planned)
                 assert vehicle == "" or vehicle in simulator.scene().roster.index
                 assert vehicle not in agents
-                if vehicle and vehicle not in erring:
-                    erring[vehicle] = simulator.disturb(vehicle, planned)
+                if vehicle and vehicle not in found:
+                    found[vehicle] = simulator.disturb(vehicle, planned)
             simulator.step(held)
-            active = [errs for errs in erring.values() if errs is not None]
-            for errs in active:
-                assert np.isfinite(errs.how_strong)
-                errs.keep()
-            for errs in active[number % 2 :: 2]:  # the others continue to the end
-                errs.end()
+            active = [disturbed for disturbed in found.values() if disturbed is not None]
+            for disturbed in active:
+                assert np.isfinite(disturbed.how_strong)
+                disturbed.keep()
+            for disturbed in active[number % 2 :: 2]:  # the others continue to the end
+                disturbed.end()
         assert self._drive(simulator, 1) == before
         simulator.close()
 
