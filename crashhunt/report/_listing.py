@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from crashhunt.base.json_types import Plain
-    from crashhunt.simulators import Setting
+    from crashhunt.scenario import ActionComponent
+    from crashhunt.simulators import Column, Setting
     from crashhunt.trial import Argument, Kind, Value
 
 _IMPORT_S = 60.0
@@ -123,13 +124,7 @@ def list_actions() -> list[ListingEntry]:
                 }
                 for one in form.settings
             ],
-            "components": [
-                {
-                    "name": one.name, "unit": one.unit, "range": one.range, "low": float(one.low),
-                    "high": float(one.high), "help": one.help,
-                }
-                for one in form.components
-            ],
+            "components": [_component(one, one.help) for one in form.components],
         }
         for name, form in ACTIONS.items()
     ]  # fmt: skip
@@ -164,38 +159,29 @@ def list_observations() -> list[ListingEntry]:
                 "shape": shape,
                 "columns": [column.name for column in part.columns],
                 "units": [column.unit for column in columns],
-                "components": [
-                    {
-                        "name": column.name,
-                        "unit": column.unit,
-                        "range": column.range,
-                        "low": column.low,
-                        "high": column.high,
-                        "help": meaning,
-                    }
-                    for column, meaning in described
-                ],
+                "components": [_component(column, meaning) for column, meaning in described],
             }
         )
     return found
 
 
-def _setting_entry(setting: Setting) -> ArgumentEntry:
-    whole, default = setting.is_whole, setting.default
-    if setting.choices:
-        words = setting.choices
-        return {
-            "name": setting.name, "kind": "str", "default": words[int(default)], "range": ",".join(words),
-            "unit": "", "help": setting.meaning,
-        }  # fmt: skip
+def _component(one: ActionComponent | Column, meaning: str) -> ComponentEntry:
     return {
-        "name": setting.name,
-        "kind": "int" if whole else "float",
-        "default": int(default) if whole else default,
-        "range": f"{setting.low:g}:{setting.high:g}",
-        "unit": setting.unit,
-        "help": setting.meaning,
-    }
+        "name": one.name, "unit": one.unit, "range": one.range, "low": float(one.low), "high": float(one.high),
+        "help": meaning,
+    }  # fmt: skip
+
+
+def _setting_entry(setting: Setting) -> ArgumentEntry:
+    entry: ArgumentEntry = {
+        "name": setting.name, "kind": "float", "default": setting.default,
+        "range": f"{setting.low:g}:{setting.high:g}", "unit": setting.unit, "help": setting.meaning,
+    }  # fmt: skip
+    if words := setting.choices:
+        entry |= {"kind": "str", "default": words[int(setting.default)], "range": ",".join(words), "unit": ""}
+    elif setting.is_whole:
+        entry |= {"kind": "int", "default": int(setting.default)}
+    return entry
 
 
 def describe(entries: Sequence[ListingEntry]) -> str:
@@ -234,20 +220,12 @@ def _arguments(arguments: Iterable[Argument]) -> list[ArgumentEntry]:
 
 
 def _table(indent: str, arguments: Sequence[ArgumentEntry]) -> list[str]:
-    rows = [
-        (
-            entry["name"],
-            entry["range"] or "",
-            f"default {without_folder(entry['default'])}"
-            if entry["default"] is not None
-            else "required"
-            if not entry["range"]
-            else "",
-            entry["unit"],
-            entry["help"],
-        )
-        for entry in arguments
-    ]
+    rows = []
+    for entry in arguments:
+        default = "" if entry["range"] else "required"
+        if entry["default"] is not None:
+            default = f"default {without_folder(entry['default'])}"
+        rows.append((entry["name"], entry["range"] or "", default, entry["unit"], entry["help"]))
     return _columns(indent, rows)
 
 

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from ._action_forms import (
         ACTIONS as ACTIONS,
         OVERRIDES_ONLY as OVERRIDES_ONLY,
+        ActionComponent as ActionComponent,
         action_settings as action_settings,
         canonical_action as canonical_action,
         check_action as check_action,

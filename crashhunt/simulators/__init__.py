@@ -52,6 +52,7 @@ if TYPE_CHECKING:
         REACH_M as REACH_M,
         REFERENCE_SHARES as REFERENCE_SHARES,
         SCENE_PARTS as SCENE_PARTS,
+        Column as Column,
         Setting as Setting,
     )
     from ._protocol import (
