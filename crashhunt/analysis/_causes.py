@@ -331,16 +331,13 @@ class _Search:
                     held=held,
                 )
             )
-        steps = [step for step in self._earlier(self._end, _GONE_S) if self._is_present(name, step)]
+        steps = [step for step in self._earlier(self._end, _GONE_S) if name in self._recording.scene(step).roster.index]
         runs = [(step, self._held(name, "gone", step)) for step in steps]
         found.append(_Candidate(Factor(kind="other", name=name, what="there", step=self._end), runs, True))
         return found
 
     def _manoeuvre_factors(self, actor: str) -> list[Manoeuvre]:
         return manoeuvres_of(self._recording, actor, self._lanes, self._end)
-
-    def _is_present(self, name: str, step: int) -> bool:
-        return name in self._recording.scene(step).roster.index
 
     def _earlier(self, step: int, ago_s: tuple[float, ...]) -> list[int]:
         return list(dict.fromkeys(max(0, step - round(each / self._dt)) for each in ago_s))

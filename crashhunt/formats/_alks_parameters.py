@@ -7,6 +7,7 @@ of ASAM. The values become the arguments of the scenario of crashhunt for the sa
 from __future__ import annotations
 
 import math
+import operator
 import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -34,10 +35,6 @@ def _same(value: float) -> float:
     return value
 
 
-def _opposite(value: float) -> float:
-    return -value
-
-
 def _kmh(value: float) -> float:
     return -3.6 * value
 
@@ -47,7 +44,7 @@ _LATERAL = "LaneChange_MaxLateralVelocity_Vy_mps"
 _CASES: tuple[tuple[str, str, Mapping[str, tuple[str, Callable[[float], float]]]], ...] = (
     ("r157-cut-in", "CutInVehicle_HeadwayDistanceTrigger_dx0_m", {
         "CutInVehicle_HeadwayDistanceTrigger_dx0_m": ("gap_m", _same),
-        "CutInVehicle_RelativeInitSpeed_Ve0_Vo0_kph": ("slower_kmh", _opposite),
+        "CutInVehicle_RelativeInitSpeed_Ve0_Vo0_kph": ("slower_kmh", operator.neg),
         f"CutInVehicle_{_LATERAL}": ("lateral_mps", _same),
         "CutInVehicle_InitPosition_RelativeLaneId": ("side", _same),
     }),

@@ -272,7 +272,7 @@ def report_data(
         "scenarioArguments": list(settings.scenario_arguments),
         "disturb": ",".join(settings.disturb),
         "units": {
-            _shown_name(agent, name, settings): unit
+            f"{agent}.{name}" if agent and len(settings.agents) > 1 else name: unit
             for (agent, name), unit in argument_units(directory, settings).items()
         },
         **_trials(directory, settings),
@@ -330,11 +330,6 @@ def _category(crash: str) -> str:
         return Outcome(crash.partition("-")[2]).category
     except ValueError:
         return "traffic crash"
-
-
-def _shown_name(agent: str, name: str, settings: HuntSettings) -> str:
-    """Return the name of an argument on the page; it includes the agent if there are several agents."""
-    return f"{agent}.{name}" if agent and len(settings.agents) > 1 else name
 
 
 def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:

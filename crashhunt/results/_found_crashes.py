@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Cause, Signature
-    from crashhunt.ledger import Facts, KindData, Noted
+    from crashhunt.ledger import Facts, Noted
     from crashhunt.trial import TrialResult
 
 _MAX_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
@@ -146,7 +146,7 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         steps = {number: steps for number, _, name, steps, _ in ledger.table() if name in crash_on}
         versions = CodeVersions.of(facts)
         apart = ledger.numbers_from(versions.earlier)
-    noted = _noted_types(facts)
+    noted = facts.get("kinds") if facts.get("kinds_version") == SIGNATURE_VERSION else None
     if apart:  # types are those of the newest code
         dropped = {words: rest for words, numbers in dropped.items() if (rest := sorted(set(numbers) - apart))}
         bundles = [bundle for bundle in list_bundles(directory) if bundle.snapshot not in versions.earlier]
@@ -167,11 +167,6 @@ def find_crashes(directory: Path, limit: int) -> FoundCrashes:
         untyped=max(0, tally.found - sum(number in apart for number in steps) - sum(types.values())),
         shown=_listed_crashes(folders, names, shortest, limit),
     )
-
-
-def _noted_types(facts: Facts) -> Sequence[KindData] | None:
-    """Return the crash types that the hunt has recorded; None if another version of crashhunt determined them."""
-    return facts.get("kinds") if facts.get("kinds_version") == SIGNATURE_VERSION else None
 
 
 def _types_of(

@@ -58,6 +58,7 @@ def environment(imported: ImportedModules | None = None) -> Environment:
     modules, variables = imported.places.keys(), imported.variables
     distributions: dict[str, str] = {}
     named = versions()
+    recorded = (*_RECORDED_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
     loaded: set[str] = set()
     for distribution in installed():
         name, version, theirs = _facts_of(distribution)
@@ -76,7 +77,7 @@ def environment(imported: ImportedModules | None = None) -> Environment:
         "versions": named,
         "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
         "loaded": sorted(loaded, key=str.lower),
-        "variables": {name: variables[name] for name in _variables() if name in variables},
+        "variables": {name: variables[name] for name in recorded if name in variables},
     }
 
 
@@ -121,10 +122,6 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
-
-
-def _variables() -> tuple[str, ...]:
-    return (*_RECORDED_VARIABLES, *(name for _, backend in installed_backends() for name in backend.variables))
 
 
 def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:

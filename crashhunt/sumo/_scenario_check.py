@@ -283,7 +283,8 @@ def _about_a_file(said: str, scenario: Scenario) -> ScenarioError:
         text = said[: line.start()].strip()
         return ScenarioError(f"SUMO says: {text}", fix=_FIX_IN_FILE, where=f"{line[1]}, line {line[2]}")
     named: list[tuple[str, str]] = _NAMED_ID.findall(_BARE_ID.sub(r"\1 '\2'", said))
-    texts, unknown = _texts(scenario), None
+    texts = {scenario.folder / name: read_xml(scenario.folder / name) for name in scenario.texts()}
+    unknown = None
     if _UNKNOWN.search(said) and named:
         unknown = named.pop("': " in said and len(named) > 1)
     fix = _FIX_IN_FILE
@@ -311,10 +312,6 @@ def places_of(name: str, scenario: Scenario) -> list[str]:
     """Return ``FILE, line N``, without the folder, of each vehicle, flow, person or calibrator with an id."""
     texts = {Path(file): read_xml(scenario.folder / file) for file in scenario.texts()}
     return _places(_DEMAND_TAGS, name, texts)
-
-
-def _texts(scenario: Scenario) -> dict[Path, bytes]:
-    return {scenario.folder / name: read_xml(scenario.folder / name) for name in scenario.texts()}
 
 
 def _places(word: str, name: str, texts: Mapping[Path, bytes]) -> list[str]:

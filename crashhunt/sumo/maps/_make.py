@@ -439,7 +439,11 @@ def describe_place(found: MadeScenario) -> list[str]:
     counts = [len(open_lanes) for open_lanes in lanes]
     speeds = [lane.speed_mps * _KMH for open_lanes in lanes for lane in open_lanes]
     side = "left" if network.left_hand else "right"
-    others = [f"{count} {kind.replace('_', ' ')}" for kind, count in network.junctions.most_common() if _is_plain(kind)]
+    others = [
+        f"{count} {kind.replace('_', ' ')}"
+        for kind, count in network.junctions.most_common()
+        if not kind.startswith("traffic_light")
+    ]
     busiest = "; ".join(
         f"{network.edges[name].name or name} {rate:,.0f}/h" for name, rate in _busiest(found)[:3]
     )  # fmt: skip
@@ -475,10 +479,6 @@ def _trial_notes(trial: PlainTrial, agent: str) -> list[str]:
         "simulator_error": "the simulator failed; crashhunt show describes its error after a hunt",
     }.get(trial.outcome)
     return [f"warning: {fix}"] if fix else []
-
-
-def _is_plain(kind: str) -> bool:
-    return not kind.startswith("traffic_light")
 
 
 def _span(values: list[int] | list[float], form: str) -> str:
