@@ -361,7 +361,7 @@ PARTS: Mapping[str, Part] = {
             meaning="the stop line of the next junction on the route",
             columns=(
                 _PRESENT,
-                _distance("distance", "distance of the front bumper to the stop line, negative inside the junction"),
+                _distance("distance", "distance of the front bumper to the stop line, negative behind it"),
                 _flag("must_yield", "1 if the rules of the junction name a stream to yield to"),
                 _flag("stop_sign", "1 if the controlled vehicle must stop at the stop line"),
                 _flag("signal", "1 if a traffic light controls the lane"),

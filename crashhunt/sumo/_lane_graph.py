@@ -221,14 +221,18 @@ class LaneGraph:
 
     @cached_property
     def stop_lines(self) -> tuple[StopLine, ...]:
-        """The stop lines of all lanes that end at a junction where a vehicle may have to stop."""
+        """The stop lines of all lanes that end at a junction where a car may have to stop."""
+        return self.stop_lines_for(USUAL_CLASS)
+
+    def stop_lines_for(self, vehicle_class: str) -> tuple[StopLine, ...]:
+        """Return the stop lines of all lanes that end at a junction where a vehicle of a class may have to stop."""
         found = []
         for lane in self.lanes.values():
             kind = "" if lane.is_internal else self._stop_kind(lane)
             if not kind:
                 continue
-            lines = self.lines(lane)
-            ends = np.array((lines.left[-1], lines.right[-1]))
+            before = lane.data.offset_m(vehicle_class) / max(lane.data.length_m, 1e-9)
+            ends = _across(self.lines(lane), 1.0 - before)
             ends.flags.writeable = False
             inside = next((link.inside[0] for link in lane.links if link.inside), "")
             signal = next((link.signal for link in lane.links if link.signal), "")
@@ -333,7 +337,7 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
 class RouteSignal(NamedTuple):
     """A traffic light on a route."""
 
-    distance_m: float  # distance from the start of the lane for which it was looked up, in m
+    distance_m: float  # distance of its stop line from the start of the lane for which it was looked up, in m
     id: str  # id of the traffic light
     link: int  # index of the link in its state
 
@@ -468,7 +472,8 @@ class RouteGuide:
         for current, _, link in self.walk(number, lane, is_best=False):
             distance += current.data.length_m
             if link is not None and link.signal and not current.is_internal:
-                found.append(RouteSignal(distance, link.signal, link.signal_index))
+                line = distance - current.data.offset_m(self.vehicle_class)
+                found.append(RouteSignal(line, link.signal, link.signal_index))
                 if len(found) == limit:
                     break
         return found
@@ -522,11 +527,18 @@ class RouteGuide:
         is_on_route = lane is not None and self.follows(number, lane)
         return RoadMap(
             lanes=self.graph.lanes_for(self.vehicle_class),
-            stop_lines=self.graph.stop_lines,
+            stop_lines=self.graph.stop_lines_for(self.vehicle_class),
             route=self.lane_sequence(number, lane) if lane is not None and is_on_route else (),
             reference_path=self.reference_path(number, lane if is_on_route else None),
             is_left_hand=self.graph.is_left_hand,
         )
+
+
+def _across(lines: LaneLines, share: float) -> Line:
+    """Return the left and the right end of a line across a lane at a share of its length, shape (2, 2)."""
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(lines.center, axis=0).T)))
+    at = share * along[-1]
+    return np.array([[np.interp(at, along, side[:, axis]) for axis in (0, 1)] for side in (lines.left, lines.right)])
 
 
 def _blended(before: Line, after: Line) -> Line:

@@ -58,7 +58,7 @@ class RightOfWayReader(RowsReader):
                 tuple(approaches), partial(self._taken_by, approaches)
             )
         facts = line, float(link.state in _STOP_STATES), self._setup.limit
-        is_usual = not moment.hidden and link.state != _ALLWAY_STOP
+        is_usual = not moment.hidden and link.state != _ALLWAY_STOP and not (place and _offset_m(place))
         if not (is_usual and draft.right_of_way(at, streams, facts)):
             super().write(draft, at, moment)
 
@@ -75,7 +75,7 @@ class RightOfWayReader(RowsReader):
         actors = scene.roster.actors
         front = -line
         rear = front - actors[row].length
-        stop_sign = float(link.state in _STOP_STATES)
+        stop_sign, stop_line = float(link.state in _STOP_STATES), line - _offset_m(place)
         rows, speeds = [], scene.speeds
         for other, actor in enumerate(actors):
             if other == row or actor.id in moment.hidden:
@@ -96,7 +96,7 @@ class RightOfWayReader(RowsReader):
                 rows.append(best)
         rows.sort()
         return [
-            (1.0, must_yield, line, distance, away, speed, arrival, stop_sign)
+            (1.0, must_yield, stop_line, distance, away, speed, arrival, stop_sign)
             for arrival, away, _, must_yield, distance, speed in rows[: self._setup.limit]
         ]
 
@@ -176,16 +176,16 @@ def _paths_of(vehicle: str, approaches: Sequence[ConflictApproach], number: int)
 
 
 def path_across(place: NetworkPlace) -> tuple[LaneLink, float] | None:
-    """Return the path across the next junction, or the present one, and the distance to its stop line, in m.
+    """Return the path across the next junction, or the present one, and the distance to its beginning, in m.
 
-    The distance is negative behind the stop line. The result is None if the lane does not lead along the route.
+    The distance is negative inside the junction. The result is None if the lane does not lead along the route.
     """
     found = path_from(place)
     return None if found is None else (found[0], found[1] - place.position_m)
 
 
 def path_from(place: NetworkPlace) -> tuple[LaneLink, float] | None:
-    """Return the path across the next junction, or the present one, and the stop line's position on the lane, in m."""
+    """Return the path across the next junction, or the present one, and its distance from the lane's start, in m."""
     lane = place.lane
     link = place.guide.link(place.number, lane) if place.number >= 0 else None
     if link is None:
@@ -196,6 +196,15 @@ def path_from(place: NetworkPlace) -> tuple[LaneLink, float] | None:
     if entry is None:
         return None
     return entry, -(entry.length_m - link.length_m - lane.data.length_m)
+
+
+def _offset_m(place: NetworkPlace) -> float:
+    """Return the distance of the stop line before the next junction, or before the present one, in m."""
+    lane = place.lane
+    link = place.guide.link(place.number, lane) if lane.is_internal else None
+    if link is not None:
+        lane = place.guide.graph.lanes[next(name for name, one in lane.entries if one.target == link.target)]
+    return lane.data.offset_m(place.guide.vehicle_class)
 
 
 class CrossingsReader(RowsReader):
@@ -246,15 +255,18 @@ class StopLineReader(Reader):
         """Return the columns of ``stop_line``."""
         place = self._setup.places.find(moment)
         path = path_across(place) if place is not None else None
-        if path is None:
+        if place is None or path is None:
             return np.zeros(self._setup.shape)
-        return np.array(self._values(*path), float)
+        return np.array(self._values(path[0], path[1] - _offset_m(place)), float)
 
     def write(self, draft: Draft, at: int, moment: AgentMoment) -> None:
         """Write the columns of ``stop_line``."""
         place = self._setup.places.find(moment)
         path = path_from(place) if place is not None else None
-        if path is not None and not draft.along(at, self._values(*path), [(1, 0.0, path[1], -math.inf)]):
+        if place is None or path is None:
+            return
+        line = path[1] - _offset_m(place)
+        if not draft.along(at, self._values(path[0], line), [(1, 0.0, line, -math.inf)]):
             super().write(draft, at, moment)
 
     def _values(self, link: LaneLink, line: float) -> tuple[float, ...]:

@@ -33,6 +33,15 @@ class NetworkLane:
     change_up: frozenset[str] | None = None
     # the vehicle classes that may change to the lane with the previous index; None for all
     change_down: frozenset[str] | None = None
+    stop_offset_m: float = 0.0  # distance of the stop line before the end of the lane, in m (SUMO's ``stopOffset``)
+    # the vehicle classes with this stop line; None for all. All others stop at the end of the lane.
+    offset_for: frozenset[str] | None = None
+    not_offset_for: frozenset[str] = frozenset()  # the vehicle classes without this stop line
+
+    def offset_m(self, vehicle_class: str) -> float:
+        """Return the distance of the stop line for a class of vehicles before the end of the lane, in m."""
+        meant = self.offset_for is None or vehicle_class in self.offset_for or "all" in self.offset_for
+        return self.stop_offset_m if meant and vehicle_class not in self.not_offset_for else 0.0
 
     def admits(self, vehicle_class: str) -> bool:
         """Return whether vehicles of a class may use the lane."""
@@ -180,7 +189,10 @@ def _read(events: Iterator[tuple[str, ET.Element]], found: RoadNetwork, *, with_
 
 def _edge(element: ET.Element) -> Edge:
     lanes = []
+    of_edge = element.find("stopOffset")
     for lane in element.iter("lane"):
+        own = lane.find("stopOffset")
+        offset = own if own is not None else of_edge if of_edge is not None else ET.Element("stopOffset")
         shape = tuple(_point(word) for word in lane.get("shape", "").split())
         lanes.append(
             NetworkLane(
@@ -192,6 +204,9 @@ def _edge(element: ET.Element) -> Edge:
                 width_m=float(lane.get("width", DEFAULT_WIDTH_M)),
                 change_up=_classes(lane, "changeLeft"),
                 change_down=_classes(lane, "changeRight"),
+                stop_offset_m=float(offset.get("value", "0")),
+                offset_for=_classes(offset, "vClasses"),
+                not_offset_for=_classes(offset, "exceptions") or frozenset(),
             )
         )
     ends = element.get("from", ""), element.get("to", "")
