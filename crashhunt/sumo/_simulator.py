@@ -189,34 +189,10 @@ class SumoSimulator:
 
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Observations, Info]:
         """Load the scenario, warm up the traffic, and put the controlled vehicles on the road."""
-        global _current
         self._stop_fast_path()
         forget_calls()
         VehicleCommand.forget_all()
-        options = options or {}
-        arguments = options.get("arguments", {})
-        self.setup_steps = 0
-        script = options.get("script")
-        self._begin(options.get("only"), script, arguments)
-        command = self._files.arguments(seed, arguments)
-        try:
-            self._demand.begin()
-            notice = self._loading.load(self._program, command)
-            _current = weakref.ref(self)
-            if notice and notice not in self._notices:
-                self._notices.append(notice)
-            if script is None and (manoeuvre := self._scenario.table(SumoSetup).manoeuvre):
-                script = self._planned_paths(manoeuvre, arguments)
-                self._begin(options.get("only"), script, arguments)
-            with steps_counted(self, self.step_length_s):
-                enter(self._scenario, self._setups, self._replaced, self._taking_part)
-            self._demand.read()
-            if script is not None:
-                place_agents(script)
-        except InvalidEpisodeError as error:
-            raise self._demand.explained(error, [*self._setups, *self._replaced]) from None
-        except _TRACI_ERRORS as error:
-            raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
+        script = self._set_up_traffic(seed, options or {})
         self.agents = list(self._setups)
         self._driving.begin(self.agents)
         for path in script.agents if script is not None else ():
@@ -232,25 +208,58 @@ class SumoSimulator:
         self._steps = 0
         self._kinematics.hidden.clear()
         self._off_road: list[str] = []
-        steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
-        self._parts.begin(self._start, sumo.simulation_getTime(), steering, seed=seed)
         self._lights = None
-        self._read_scene()
-        observations = self._observe_all()
+        observations = self._observe_start(seed)
         usual = self._usual_steps()
         if self._sight.core is not None and self._is_core_wrong(observations, usual):
             self._sight.distrust()
-            self._parts.core = None
-            self._parts.begin(self._start, sumo.simulation_getTime(), steering, seed=seed)
+            self._parts.core = usual = None
             self._notices.append(_CORE_DISABLED_NOTICE)
-            self._read_scene()
-            observations, usual = self._observe_all(), None
+            observations = self._observe_start(seed)
         routes = {agent: motion.edges for agent, motion in self._driving.moving.items()}
         self._events.begin(self._scene, self.agents, self._moved, routes)
         self._shown, self.at_once = observations, usual
         if usual is not None:
             usual.begin()
         return observations, {}
+
+    def _set_up_traffic(self, seed: int, options: Options) -> Paths | None:
+        """Load the scenario, warm up, and insert the controlled vehicles; return the paths of the scripted actors.
+
+        Raises:
+            InvalidEpisodeError: a controlled vehicle cannot be inserted, or SUMO reports an error.
+        """
+        global _current
+        arguments, only, script = options.get("arguments", {}), options.get("only"), options.get("script")
+        self.setup_steps = 0
+        self._begin(only, script, arguments)
+        command = self._files.arguments(seed, arguments)
+        try:
+            self._demand.begin()
+            notice = self._loading.load(self._program, command)
+            _current = weakref.ref(self)
+            if notice and notice not in self._notices:
+                self._notices.append(notice)
+            if script is None and (manoeuvre := self._scenario.table(SumoSetup).manoeuvre):
+                script = self._planned_paths(manoeuvre, arguments)
+                self._begin(only, script, arguments)
+            with steps_counted(self, self.step_length_s):
+                enter(self._scenario, self._setups, self._replaced, self._taking_part)
+            self._demand.read()
+            if script is not None:
+                place_agents(script)
+        except InvalidEpisodeError as error:
+            raise self._demand.explained(error, [*self._setups, *self._replaced]) from None
+        except _TRACI_ERRORS as error:
+            raise InvalidEpisodeError(f"SUMO could not set up the episode: {_one_line(error)}") from error
+        return script
+
+    def _observe_start(self, seed: int) -> Observations:
+        """Read the scene before the first step, and return what the agents observe in it."""
+        steering = {agent: motion.steering for agent, motion in self._driving.moving.items()}
+        self._parts.begin(self._start, sumo.simulation_getTime(), steering, seed=seed)
+        self._read_scene()
+        return self._observe_all()
 
     party = Party.SIMULATOR
     foreign_packages = ("libsumo", "sumolib", "traci")
