@@ -29,10 +29,6 @@ def written(shell, text: str) -> None:
     (shell.folder / "suite.toml").write_text(text, encoding="utf-8")
 
 
-def numbers(shell, hunt: str) -> list[int]:
-    return [int(line.partition(",")[0]) for line in shell.crashhunt("trials", hunt).out.splitlines()[1:]]
-
-
 @pytest.mark.nightly
 def test_every_hunt_stops_at_its_own_first_crash(toy):
     written(toy, SUITE)

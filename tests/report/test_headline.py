@@ -134,6 +134,12 @@ def test_gradual_lane_change_reports_its_side_and_the_gap_at_that_time(side, wor
     )
 
 
+def on_three_lanes(record):
+    borders = [(np.array([(-200.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-200.0, y + 1.6), (200.0, y + 1.6)]))
+               for y in (-3.2, 0.0, 3.2)]  # fmt: skip
+    return replace(record, lanes=LaneMap(borders, (0.0, 0.0)))
+
+
 @pytest.mark.parametrize(("side", "word"), [(-1, "left"), (1, "right")])
 def test_lane_change_under_way_at_the_contact_is_not_called_complete(side, word):
     """The ego drifts for 2 s, and its centre is still in its own lane when it touches the vehicle alongside."""
@@ -141,9 +147,7 @@ def test_lane_change_under_way_at_the_contact_is_not_called_complete(side, word)
     def poses(time_s):
         return [(12 * time_s, side * (1.99 - 0.8 * max(-2.0, time_s)), 0.0, 12.0), (12 * time_s, 0.0, 0.0, 12.0)]
 
-    borders = [(np.array([(-200.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-200.0, y + 1.6), (200.0, y + 1.6)]))
-               for y in (-3.2, 0.0, 3.2)]  # fmt: skip
-    record = replace(contact(poses), lanes=LaneMap(borders, (0.0, 0.0)))
+    record = on_three_lanes(contact(poses))
     assert describe_contact(record).startswith(f"ego was changing to the {word} lane and touched the side of x")
 
 
@@ -154,9 +158,7 @@ def test_verdict_names_the_lane_changes_of_both_into_one_lane():
         x_aside = 0.0 if time_s > -0.25 else -3.2
         return [(20 * time_s, 1.0 - 0.8 * max(-2.0, time_s), 0.0, 20.0), (4.9 + 12 * time_s, x_aside, 0.0, 12.0)]
 
-    borders = [(np.array([(-200.0, y - 1.6), (200.0, y - 1.6)]), np.array([(-200.0, y + 1.6), (200.0, y + 1.6)]))
-               for y in (-3.2, 0.0, 3.2)]  # fmt: skip
-    record = replace(contact(poses), lanes=LaneMap(borders, (0.0, 0.0)))
+    record = on_three_lanes(contact(poses))
     assert describe_contact(record) == (
         "ego changed to the right lane 0.7 s before, x changed to the left lane 0.2 s before, and ego drove into the "
         "back of x at 20.0 m/s against 12.0 m/s"

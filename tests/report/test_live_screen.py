@@ -37,11 +37,16 @@ def status(workers: int) -> HuntStatus:
     return HuntStatus("hunting", 1000, 123, outcomes, 12.3, 65.0, nearest, boxes, 2)
 
 
-def screen(width: int, height: int, workers: int) -> list[str]:
+def screen_of(status, *, width=100, height=12):
+    """Return what a terminal of that size shows of a status."""
     console = Console(width=width, height=height, force_terminal=True, color_system=None)
     with console.capture() as shown:
-        console.print(Watcher(console, TITLE)._screen(status(workers)))
-    return [line.rstrip() for line in shown.get().splitlines()]
+        console.print(Watcher(console, TITLE)._screen(status))
+    return shown.get()
+
+
+def screen(width: int, height: int, workers: int) -> list[str]:
+    return [line.rstrip() for line in screen_of(status(workers), width=width, height=height).splitlines()]
 
 
 @pytest.mark.parametrize(("width", "height", "workers"), [(40, 24, 8), (40, 13, 8), (40, 12, 4), (120, 12, 32)])
@@ -60,13 +65,11 @@ def test_what_the_search_tries_and_when_danger_last_grew_is_shown_where_there_is
     tried = StrategyStatus("mutation", 60, 0.6, 0.3125, 1), StrategyStatus("random", 40, 0.4, None, 0)
     found = replace(status(2), search=SearchStatus(tried, 1, 65.0))
     for height, shown in ((12, True), (6, False)):
-        console = Console(width=120, height=height, force_terminal=True, color_system=None)
-        with console.capture() as seen:
-            console.print(Watcher(console, TITLE)._screen(found))
+        seen = screen_of(found, width=120, height=height)
         assert (
-            "search: mutation 60 % of trials (mean criticality 0.31, 1 crash), random 40 % of trials" in seen.get()
+            "search: mutation 60 % of trials (mean criticality 0.31, 1 crash), random 40 % of trials" in seen
         ) is shown
-        assert "nearest miss (1 trial / 1:05 ago): trial 123" in seen.get()
+        assert "nearest miss (1 trial / 1:05 ago): trial 123" in seen
 
 
 def test_plain_lines_of_a_phase_are_printed_on_change_only(monkeypatch):
@@ -84,11 +87,9 @@ def test_the_least_stress_margin_is_shown_where_there_is_room():
     brake = Disturbance(80, "ahead", "brake", 2.25, 3.0, "ego")
     stressed = replace(found.nearest, stress=Stress(0.375, 20, 900, 0, brake, "collision", 120))
     for height, shown in ((12, True), (6, False)):
-        console = Console(width=100, height=height, force_terminal=True, color_system=None)
-        with console.capture() as captured:
-            console.print(Watcher(console, TITLE)._screen(replace(found, stressed=stressed)))
+        captured = screen_of(replace(found, stressed=stressed), width=100, height=height)
         line = "least robustness margin: 0.38, trial 123, the actor ahead of ego brakes with 2.25 m/s² for 3 s"
-        assert (line in captured.get()) is shown
+        assert (line in captured) is shown
 
 
 @pytest.mark.parametrize(("arguments", "words"), [({}, ""), ({"ego": {"speed": 2.5}}, ", speed=2.5")])
@@ -104,21 +105,17 @@ def test_margin_that_is_not_fully_asked_is_shown_as_such():
     brake = Disturbance(80, "ahead", "brake", 2.25, 3.0, "ego")
     half = Stress(None, 20, 900, 0, brake, "collision", 120, moments=9, moments_asked=1, margin_upper_bound=0.375)
     shown = replace(found, stressed=replace(found.nearest, stress=half), not_fully_asked=2)
-    console = Console(width=100, height=12, force_terminal=True, color_system=None)
-    with console.capture() as captured:
-        console.print(Watcher(console, TITLE)._screen(shown))
-    assert "least robustness margin: at most 0.38 (asked 1 of 9), trial 123" in captured.get()
-    assert "2 trials were not fully probed: copies of them died" in captured.get()
+    captured = screen_of(shown)
+    assert "least robustness margin: at most 0.38 (asked 1 of 9), trial 123" in captured
+    assert "2 trials were not fully probed: copies of them died" in captured
 
 
 def test_kinds_of_crashes_and_when_the_last_new_one_came():
     kind = SimpleNamespace(signature="rear end, the agent into the other", count=2)
     found = replace(status(2), kinds=(kind, kind), newest_kind_s=192.0, newest_kind_trials=1)
     for width in (40, 100):
-        console = Console(width=width, height=12, force_terminal=True, color_system=None)
-        with console.capture() as shown:
-            console.print(Watcher(console, TITLE)._screen(found))
-        lines = [line.rstrip() for line in shown.get().splitlines()]
+        shown = screen_of(found, width=width, height=12)
+        lines = [line.rstrip() for line in shown.splitlines()]
         assert len(lines) < 12
         assert any(line.startswith("2 crash types (last new type: 1 trial") for line in lines)
     assert any("(last new type: 1 trial / 3:12 ago): rear end, the" in line for line in lines)
@@ -131,10 +128,8 @@ def test_long_lines_fold_on_a_screen_of_80_columns():
     kind = SimpleNamespace(signature="rear end, the agent into the other, while the agent changes lanes", count=2)
     rate = PLAIN | {"crashes": 1, "origin": "random", "certain": {"low": 1e-4, "high": 0.02}}
     found = replace(status(2), rate=rate, kinds=(kind,), newest_kind_s=192.0, newest_kind_trials=1)
-    console = Console(width=80, height=40, force_terminal=True, color_system=None)
-    with console.capture() as shown:
-        console.print(Watcher(console, TITLE)._screen(found))
-    text = " ".join(shown.get().split())
+    shown = screen_of(found, width=80, height=40)
+    text = " ".join(shown.split())
     assert describe_running(rate) in text
     assert "while the agent changes lanes (2)" in text
     assert "…" not in text.partition("crash rate")[2]
@@ -158,11 +153,7 @@ def test_first_line_has_the_phase(phase, head):
 )
 def test_how_many_crashes_had_disturbances(crashes, disturbed, said):
     found = replace(status(2), crashes=crashes, disturbed=disturbed)
-    console = Console(width=100, height=12, force_terminal=True, color_system=None)
-    with console.capture() as shown:
-        console.print(Watcher(console, TITLE)._screen(found))
-        console.print(_line(found))
-    *screen, line = shown.get().splitlines()
+    *screen, line = f"{screen_of(found)}{_line(found)}".splitlines()
     for told in ("\n".join(screen), line):
         assert (said in told) if said else ("disturbances" not in told)
 
@@ -187,10 +178,8 @@ def test_nodes_are_on_the_screen_and_in_the_line():
         (nodes, ["node n0   4 at a time   0 trials   1.2/s", "and 8 more nodes"]),
         ((), ["no node is connected; the hunt waits"]),
     ):
-        console = Console(width=60, height=12, force_terminal=True, color_system=None)
-        with console.capture() as captured:
-            console.print(Watcher(console, TITLE)._screen(replace(status(2), nodes=shown)))
-        lines = [line.rstrip() for line in captured.get().splitlines()]
+        captured = screen_of(replace(status(2), nodes=shown), width=60, height=12)
+        lines = [line.rstrip() for line in captured.splitlines()]
         assert len(lines) < 12
         assert [line for line in lines if "node" in line] == expected or len(shown) == 9
         assert expected[-1] in lines or len(shown) == 9
@@ -247,10 +236,8 @@ def test_reports_exports_and_films_say_how_far_they_are(toy, made_once):
 
 def test_a_hunt_without_a_last_trial_goes_by_the_clock():
     by_clock = replace(status(2), planned=0, time_left_s=195.0)
-    console = Console(width=80, height=24, force_terminal=True, color_system=None)
-    with console.capture() as shown:
-        console.print(Watcher(console, TITLE)._screen(by_clock))
-    line = shown.get().splitlines()[1]
+    shown = screen_of(by_clock, width=80, height=24)
+    line = shown.splitlines()[1]
     assert "123 trials" in line
     assert "3:15 left" in line
     assert line.count("━") == 7 + 23 or "╸" in line  # a quarter of the time is over
@@ -305,10 +292,8 @@ def test_running_rate_is_on_the_screen_and_in_the_line(rate, words):
     found = replace(status(2), rate=rate)
     assert _line(found).endswith(f"; {words}")
     assert words not in _line(replace(found, done=0))  # before the first result, it says nothing
-    console = Console(width=160, height=12, force_terminal=True, color_system=None)
-    with console.capture() as shown:
-        console.print(Watcher(console, TITLE)._screen(found))
-    assert words in shown.get()
+    shown = screen_of(found, width=160, height=12)
+    assert words in shown
 
 
 def test_screen_of_a_terminal_needs_no_thread():

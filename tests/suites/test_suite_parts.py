@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +17,6 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.plans import AgentSettings, HuntSettings, Request, RunSettings, read_settings, write_settings
 from crashhunt.results import hunt_state
-from crashhunt.scenario import shipped_scenarios
 from crashhunt.suites import (
     RunRequest,
     Suite,
@@ -376,17 +374,6 @@ def test_finished_hunts_that_a_suite_does_not_run_again_are_reported_with_change
         f"Fix: crashhunt rerun {tmp_path} --all runs all hunts with today's files"
     )
     assert len(compared) == 2  # one for each snapshot
-
-
-def test_default_suite_has_every_scenario_with_its_agents():
-    text = _suite.default_suite()
-    data = tomllib.loads(text)
-    assert [one["id"] for one in data["hunts"]] == sorted(shipped_scenarios())
-    assert all(one["scenario"] == one["id"] for one in data["hunts"])
-    assert all(("agent" in one) != ("agents" in one) for one in data["hunts"])
-    assert data["defaults"] == {"runs": 1, "trials": 300, "max_steps": 1500, "keep_going": False}
-    assert "# arguments.speed = " in text
-    assert "# scenario_arguments." in text
 
 
 def test_settings_on_disk_are_what_a_request_keeps(hunt):
