@@ -101,26 +101,3 @@ class HangsUnlessFirst(Fine):
 
     def go_wrong(self):
         raise ValueError("no plan")
-
-
-class Remembers(Fine):
-    """Goes faster from trial to trial, by what only a file remembers."""
-
-    def act(self, observation):
-        self.step += 1
-        memory = Path(__file__).parent / "memory.txt"
-        if self.step == 3:
-            with memory.open("a") as file:
-                file.write("x")
-        return 4.0 + (memory.stat().st_size if memory.exists() else 0) / 100, 0
-
-
-class Waits(Fine):
-    """Stops before the step that the file ``wait-at`` names, and writes its process into the file ``waits``."""
-
-    def act(self, observation):
-        if Path("wait-at").exists() and Path("wait-at").read_text() == str(self.step):
-            Path("waits.part").write_text(str(os.getpid()))
-            Path("waits.part").rename("waits")
-            time.sleep(1000)
-        return super().act(observation)

@@ -51,20 +51,6 @@ class Logged:
         self._pool.close()
 
 
-class Everywhere(Logged):
-    """Finds out itself how many trials 0 stands for."""
-
-    sizes_itself = True
-
-    def __init__(self, settings, *, parallel):
-        super().__init__(settings, parallel=parallel or 2, argument=f"asked {parallel}")
-
-    def nodes(self):
-        from crashhunt.executors import NodeFigures
-
-        return [NodeFigures("there", self.capacity, 3, 1.5)]
-
-
 class Broken:
     def __init__(self, settings, *, parallel):
         raise RuntimeError("no cluster\\nhere")
@@ -119,7 +105,7 @@ def test_an_executor_of_somebodys_own_runs_the_trials(mine):
         ("pool:3", "--executor pool:3: 'pool' takes no argument; write --executor pool"),
         ("mine:Nothing", "'mine:Nothing': mine has no attribute 'Nothing'"),
         ("elsewhere:Pool:3", "No module named 'elsewhere'"),
-        ("mine:Everywhere:x", "'mine:Everywhere' takes no argument"),
+        ("mine:Broken:x", "'mine:Broken' takes no argument"),
     ],
 )
 def test_what_there_is_not_is_one_line(mine, name, message):
