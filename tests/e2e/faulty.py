@@ -5,7 +5,6 @@ import math
 import os
 import sys
 import time
-from pathlib import Path
 
 
 class Fine:
