@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
 
 class Column(NamedTuple):
@@ -94,36 +95,22 @@ _POSITION_M, _DISTANCE_M, _SPEED_MPS, _ACCELERATION_MPS2, _TIME_S = 1e8, 1e7, 1e
 _PI = math.pi
 
 
-def _flag(name: str, meaning: str) -> Column:
-    return Column(name, "", 0.0, 1.0, meaning)
+def _quantity(unit: str, low: float, high: float) -> Callable[[str, str], Column]:
+    """Return a function that makes a column of a quantity from its name and meaning."""
+    return lambda name, meaning: Column(name, unit, low, high, meaning)
 
 
-def _position(name: str, meaning: str) -> Column:
-    return Column(name, "m", -_POSITION_M, _POSITION_M, meaning)
-
-
-def _distance(name: str, meaning: str) -> Column:
-    return Column(name, "m", -_DISTANCE_M, _DISTANCE_M, meaning)
-
-
-def _size(name: str, meaning: str) -> Column:
-    return Column(name, "m", 0.0, 1e3, meaning)
+_flag = _quantity("", 0.0, 1.0)
+_position = _quantity("m", -_POSITION_M, _POSITION_M)
+_distance = _quantity("m", -_DISTANCE_M, _DISTANCE_M)
+_size = _quantity("m", 0.0, 1e3)
+_speed = _quantity("m/s", -_SPEED_MPS, _SPEED_MPS)
+_acceleration = partial(_quantity("m/s²", -_ACCELERATION_MPS2, _ACCELERATION_MPS2), "acceleration")
+_time = _quantity("s", 0.0, _TIME_S)
 
 
 def _heading(meaning: str) -> Column:
     return Column("heading", "rad", -_PI, _PI, f"{meaning}, counter-clockwise from the x axis")
-
-
-def _speed(name: str, meaning: str) -> Column:
-    return Column(name, "m/s", -_SPEED_MPS, _SPEED_MPS, meaning)
-
-
-def _acceleration(meaning: str) -> Column:
-    return Column("acceleration", "m/s²", -_ACCELERATION_MPS2, _ACCELERATION_MPS2, meaning)
-
-
-def _time(name: str, meaning: str) -> Column:
-    return Column(name, "s", 0.0, _TIME_S, meaning)
 
 
 REACH_M = 120.0
