@@ -53,15 +53,12 @@ class _Mapping:
 
 
 class SharedState:
-    """The files and memory that this process shares with its forks. Each fork first calls `separate`.
-
-    Attributes:
-        remaining: description of a file that is too large to copy, or of a pipe or socket; empty if there is none.
-    """
+    """The files and memory that this process shares with its forks. Each fork first calls `separate`."""
 
     def __init__(self, known: Collection[int] = ()) -> None:
         self._files: list[_File] = []
         self._mappings: list[_Mapping] = []
+        # description of a file that is too large to copy, or of a pipe or socket; empty if there is none
         self.remaining = ""
         for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names are enough
             with suppress(OSError):  # the descriptor by which they are listed

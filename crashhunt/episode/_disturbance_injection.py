@@ -309,9 +309,6 @@ class _NoisyParts:
         rng: The random generator of the disturbance.
         steps: Number of steps with errors.
         is_first: Whether the first observation is that of the start of the episode.
-
-    Attributes:
-        after: Number of steps after these in which the observation still stacks observations with errors.
     """
 
     def __init__(
@@ -327,6 +324,7 @@ class _NoisyParts:
         self._share, self._layout, self._center, self._rng = share, layout, center, rng
         self._left, self._is_first = steps, is_first
         self._received: Array | None = None
+        # number of steps after these in which the observation still stacks observations with errors
         self.after = max(0, layout.history - 1)
 
     def __call__(self, array: Array) -> Array:

@@ -43,17 +43,15 @@ class HuntDirectory:
     """The directory of a hunt, with its lock and scratch folder.
 
     The directory is created if it does not exist.
-
-    Attributes:
-        has_begun: whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt,
-            and restores the settings of a hunt that was to resume.
-        settings_before: settings of a hunt that was to resume; None before `claim`, and for a new hunt.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._absolute = path.absolute()  # now, because the current folder may be deleted while the hunt runs
+        # whether the hunt has begun. Before that, an error deletes a directory that was created for the hunt, and
+        # restores the settings of a hunt that was to resume.
         self.has_begun = False
+        # settings of a hunt that was to resume; None before `claim`, and for a new hunt
         self.settings_before: HuntSettings | None = None
         self._file_before: bytes | None = None
 

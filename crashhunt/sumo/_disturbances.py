@@ -300,16 +300,13 @@ _FOR_EVER_S = 3600.0  # how long a command to change lanes holds: longer than an
 
 
 class SumoDisturbances:
-    """Finds the target actors of disturbances, and disturbs them.
-
-    Attributes:
-        speeds: Speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them.
-    """
+    """Finds the target actors of disturbances, and disturbs them."""
 
     def __init__(self, controlled: Collection[str], step_length_s: float, driving: Driving) -> None:
         self._controlled = controlled
         self._dt = step_length_s
         self._driving = driving
+        # speeds in m/s of moved persons, by SUMO id, because SUMO reports 0 for them
         self.speeds: dict[str, float] = {}
         self._junctions = JunctionLanes()
 

@@ -22,24 +22,20 @@ if TYPE_CHECKING:
 
 
 class TrafficFrame:
-    """The positions of all objects at one time, with coordinates on the lanes that are computed when needed.
-
-    Attributes:
-        plain: Whether all positions have the usual data type; otherwise the frame must not be used.
-        things: The vehicles, then the objects.
-        row: The number of each object in `things`, by its ``id()``.
-        places: The positions of the objects in m, of shape (things, 2).
-    """
+    """The positions of all objects at one time, with coordinates on the lanes that are computed when needed."""
 
     def __init__(self, network: Network, road: Road) -> None:
         self.network = network
         self.road = road
         self._looks_further = road.neighbour_vehicles_connected_lanes
-        self.things: list[RoadObject] = road.vehicles + road.objects
+        self.things: list[RoadObject] = road.vehicles + road.objects  # the vehicles, then the objects
+        # the number of each object in `things`, by its ``id()``
         self.row = {id(thing): row for row, thing in enumerate(self.things)}
+        # whether all positions have the usual data type; otherwise the frame must not be used
         self.plain = are_plain(self.things)
         if not self.plain:
             return
+        # the positions of the objects in m, of shape (things, 2)
         self.places: NDArray[np.float64] = _places_of(self.things)
         self._columns: dict[int, tuple[list[float], list[float]]] = {}
         self._queues: dict[int, tuple[list[float], list[RoadObject]]] = {}

@@ -24,22 +24,17 @@ watches: dict[str, Watch] = {}
 
 
 class Prepared:
-    """The cached data of a road: its network, and the states of its vehicles.
-
-    Attributes:
-        network: The lanes of the road.
-        frame: The positions when they were last read.
-        alone: Whether no foreign code runs between the sub-steps of the road, so that the state stays valid.
-        in_step: Whether a step of the environment runs, in which the observation follows the last sub-step.
-        checked: Whether road and vehicles have been compared with the kernel's since foreign code last ran.
-    """
+    """The cached data of a road: its network, and the states of its vehicles."""
 
     def __init__(self, road: Road) -> None:
         self.road = road  # keeps the road alive, so that no other road can get its id()
-        self.network = Network(road.network)
-        self.frame: TrafficFrame | None = None
+        self.network = Network(road.network)  # the lanes of the road
+        self.frame: TrafficFrame | None = None  # the positions when they were last read
+        # whether no foreign code runs between the sub-steps of the road, so that the state stays valid
         self.alone = False
+        # whether a step of the environment runs, in which the observation follows the last sub-step
         self.in_step = False
+        # whether road and vehicles have been compared with the kernel's since foreign code last ran
         self.checked = False
         self._roster: KernelObjects | None = None
         self._kept: RoadState | None = None

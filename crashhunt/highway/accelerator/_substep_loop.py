@@ -179,16 +179,13 @@ _READ_ATTRIBUTES = ("steps", "config", "viewer", "enable_auto_render", "road", "
 
 
 class _EnvironmentKind:
-    """Properties of a class of environments.
-
-    Attributes:
-        is_plain: Whether only code of highway-env runs between sub-steps, except for the agents' actions.
-        inherits: The names of those methods that the class inherits from `AbstractEnv`.
-    """
+    """Properties of a class of environments."""
 
     def __init__(self, kind: type[AbstractEnv]) -> None:
         self.own = Own(kind, AbstractEnv, _READ_ATTRIBUTES)
+        # whether only code of highway-env runs between sub-steps, except for the agents' actions
         self.is_plain = self.own.plain and not self.own.has("_automatic_rendering")
+        # the names of those methods that the class inherits from `AbstractEnv`
         self.inherits = frozenset(name for name in ("_simulate", "vehicle") if not self.own.has(name))
 
 
