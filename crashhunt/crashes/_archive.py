@@ -49,19 +49,12 @@ class ArchiveIndex(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Archive:
-    """An archive that has been unpacked and checked.
+    """An archive that has been unpacked and checked."""
 
-    Args:
-        directory: directory of the unpacked hunt.
-        made_by: name of the tool that made the archive, as recorded in the archive.
-        made_at: time of the export, as recorded in the archive.
-        made_here: whether this user made the archive on this machine, which its signature proves.
-    """
-
-    directory: Path
-    made_by: str
-    made_at: str
-    made_here: bool
+    directory: Path  # directory of the unpacked hunt
+    made_by: str  # name of the tool that made the archive, as recorded in the archive
+    made_at: str  # time of the export, as recorded in the archive
+    made_here: bool  # whether this user made the archive on this machine, which its signature proves
 
 
 def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) -> int:

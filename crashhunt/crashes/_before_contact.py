@@ -30,23 +30,14 @@ _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larg
 
 @dataclass(frozen=True, slots=True)
 class ApproachPath:
-    """The motion of an actor before the contact, with one row for each of the times of an `Approach`.
+    """The motion of an actor before the contact, with one row for each of the times of an `Approach`."""
 
-    Args:
-        id: identifier of the actor.
-        points: x and y of its front bumper, shape (n, 2), in m.
-        headings: headings of the actor, shape (n,), in rad.
-        speeds: speeds of the actor, shape (n,), in m/s.
-        length: length of the actor, in m.
-        width: width of the actor, in m.
-    """
-
-    id: str
-    points: NDArray[np.float64]
-    headings: NDArray[np.float64]
-    speeds: NDArray[np.float64]
-    length: float
-    width: float
+    id: str  # identifier of the actor
+    points: NDArray[np.float64]  # x and y of its front bumper, shape (n, 2), in m
+    headings: NDArray[np.float64]  # headings of the actor, shape (n,), in rad
+    speeds: NDArray[np.float64]  # speeds of the actor, shape (n,), in m/s
+    length: float  # length of the actor, in m
+    width: float  # width of the actor, in m
 
     @property
     def centers(self) -> NDArray[np.float64]:
@@ -56,31 +47,18 @@ class ApproachPath:
 
 @dataclass(frozen=True)
 class Approach:
-    """The seconds before the contact of an agent with another actor.
+    """The seconds before the contact of an agent with another actor."""
 
-    Args:
-        agent: identifier of the controlled vehicle.
-        other: identifier of the collision partner.
-        scenes: scenes up to the end of the step in which the actors touched.
-        time_s: simulation time of the first contact.
-        began_s: simulation time at which the episode began.
-        lanes: lanes around the place of the contact.
-        events: events of the last seconds, each with its simulation time.
-        right_of_way: right of way of the map; None if the map has none.
-        lane: the lane of the agent at the contact; empty if it is unknown.
-        swept: whether actors move continuously between scenes and change lanes instantly, as in `Scene`.
-    """
-
-    agent: str
-    other: str
-    scenes: Sequence[Scene]
-    time_s: float
-    began_s: float
-    lanes: LaneMap
-    events: tuple[tuple[float, Event], ...] = ()
-    right_of_way: RightOfWay | None = None
-    lane: str = ""
-    swept: bool = True
+    agent: str  # identifier of the controlled vehicle
+    other: str  # identifier of the collision partner
+    scenes: Sequence[Scene]  # scenes up to the end of the step in which the actors touched
+    time_s: float  # simulation time of the first contact
+    began_s: float  # simulation time at which the episode began
+    lanes: LaneMap  # lanes around the place of the contact
+    events: tuple[tuple[float, Event], ...] = ()  # events of the last seconds, each with its simulation time
+    right_of_way: RightOfWay | None = None  # right of way of the map; None if the map has none
+    lane: str = ""  # the lane of the agent at the contact; empty if it is unknown
+    swept: bool = True  # whether actors move continuously between scenes and change lanes instantly, as in `Scene`
 
     @cached_property
     def before(self) -> list[Scene]:

@@ -43,19 +43,12 @@ _MIN_FINGERPRINT_CHARACTERS = 6  # characters of a fingerprint that name an orig
 
 @dataclass(frozen=True, slots=True)
 class TrustedOrigin(Serializable):
-    """Code that this user has decided to trust.
+    """Code that this user has decided to trust."""
 
-    Args:
-        fingerprint: SHA-256 of everything that determines the code that would run, in hexadecimal.
-        path: path of the code when the user trusted it.
-        runs: a description of what would run, in words.
-        trusted_at: time (UTC) at which the user trusted the code.
-    """
-
-    fingerprint: str
-    path: str
-    runs: str
-    trusted_at: str
+    fingerprint: str  # SHA-256 of everything that determines the code that would run, in hexadecimal
+    path: str  # path of the code when the user trusted it
+    runs: str  # a description of what would run, in words
+    trusted_at: str  # time (UTC) at which the user trusted the code
 
     @property
     def id(self) -> str:

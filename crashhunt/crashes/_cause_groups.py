@@ -28,21 +28,16 @@ class Cause(Serializable):
     """The cause of a crash, as determined by runs.
 
     A cause contains no speeds, identifiers or times, because these differ between trials.
-
-    Args:
-        kind: type of the cause: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software
-            fault`` or ``unknown``.
-        what: For an omission, what the agent disregarded, as in `Omission`. For a lane change into an unsafe gap, ``gap
-            left`` or ``gap right``. For a decision, the action of the agent; for a disturbance, its type; for an
-            argument, its name.
-        instead: the action of the agent in place of the omitted action.
-        actor: the text ``long`` if the disregarded actor is longer than a car, else empty.
     """
 
+    # type of the cause: ``omission``, ``decision``, ``disturbance``, ``argument``, ``traffic``, ``software fault`` or
+    # ``unknown``
     kind: str
+    # For an omission, what the agent disregarded, as in `Omission`. For a lane change into an unsafe gap, ``gap left``
+    # or ``gap right``. For a decision, the action of the agent; for a disturbance, its type; for an argument, its name.
     what: str = ""
-    instead: str = ""
-    actor: str = ""
+    instead: str = ""  # the action of the agent in place of the omitted action
+    actor: str = ""  # the text ``long`` if the disregarded actor is longer than a car, else empty
 
     @property
     def is_defect(self) -> bool:
@@ -72,17 +67,12 @@ class Cause(Serializable):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CauseGroup:
-    """Crashes of the same crash type with the same cause.
+    """Crashes of the same crash type with the same cause."""
 
-    Args:
-        cause: the common cause of the crashes.
-        members: the crashes, in the order in which they were found.
-        judged: the crashes whose cause was determined by runs. Every other crash is given the cause of the most similar
-            judged crash.
-    """
-
-    cause: Cause
-    members: tuple[Bundle, ...]
+    cause: Cause  # the common cause of the crashes
+    members: tuple[Bundle, ...]  # the crashes, in the order in which they were found
+    # the crashes whose cause was determined by runs. Every other crash is given the cause of the most similar judged
+    # crash.
     judged: tuple[Bundle, ...]
 
     @property
@@ -104,14 +94,10 @@ class CauseGroup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CauseType:
-    """Crashes with the same cause, of one crash type or several: what a user would report as one defect.
+    """Crashes with the same cause, of one crash type or several: what a user would report as one defect."""
 
-    Args:
-        cause: the common cause of the crashes.
-        variants: the crash types of the crashes, each with the crashes that have this cause, the most frequent first.
-    """
-
-    cause: Cause
+    cause: Cause  # the common cause of the crashes
+    # the crash types of the crashes, each with the crashes that have this cause, the most frequent first
     variants: tuple[tuple[Group, CauseGroup], ...]
 
     @property

@@ -60,13 +60,9 @@ _MIN_COURSE_M = 0.5  # driven, to know in which direction the front of a vehicle
 
 @dataclass(frozen=True)
 class ContactRecord(Approach):
-    """The contact of an agent with another actor.
+    """The contact of an agent with another actor."""
 
-    Args:
-        reported: the collision that the result of the trial contains; None if it is unknown.
-    """
-
-    reported: Collision | None = None
+    reported: Collision | None = None  # the collision that the result of the trial contains; None if it is unknown
 
     def _at_contact(self, actor: str) -> tuple[NDArray[np.float64], float]:
         """Return the centre of an actor at the contact, in m, and its heading, in rad."""

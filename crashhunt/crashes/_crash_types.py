@@ -48,17 +48,11 @@ _LIBRARY_PATH = re.compile(r"(site|dist)-packages|python3\.\d+")
 
 @dataclass(frozen=True, slots=True)
 class StackFrame:
-    """A function call in a traceback.
+    """A function call in a traceback."""
 
-    Args:
-        file: path of the source file.
-        line: line in the source file, counted from 1.
-        function: name of the function.
-    """
-
-    file: PurePath
-    line: int
-    function: str
+    file: PurePath  # path of the source file
+    line: int  # line in the source file, counted from 1
+    function: str  # name of the function
 
 
 def own_frames(failure: Failure) -> list[StackFrame]:
@@ -206,19 +200,12 @@ def _innermost_frames(failure: Failure) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Group(Serializable):
-    """Crashes with the same signature.
+    """Crashes with the same signature."""
 
-    Args:
-        signature: the common signature of all crashes.
-        bundles: bundles in the order in which they were given; at least one.
-        faults: vehicle at fault in each of these crashes; empty if that was not requested.
-        dropped: number of further crashes whose bundles were deleted (``--keep``).
-    """
-
-    signature: Signature
-    bundles: tuple[Bundle, ...]
-    faults: tuple[Verdict, ...] = ()
-    dropped: int = 0
+    signature: Signature  # the common signature of all crashes
+    bundles: tuple[Bundle, ...]  # bundles in the order in which they were given; at least one
+    faults: tuple[Verdict, ...] = ()  # vehicle at fault in each of these crashes; empty if that was not requested
+    dropped: int = 0  # number of further crashes whose bundles were deleted (``--keep``)
 
     json_keys = (
         "words", "signature", "count", "saved", "outcome=signature.outcome", "manner=signature.manner", "fault",
@@ -277,14 +264,10 @@ class Group(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Groups:
-    """The result of grouping crashes.
+    """The result of grouping crashes."""
 
-    Args:
-        groups: the groups, the largest first.
-        left_out: The crashes without a crash type, each with the reason, such as a missing or damaged log.
-    """
-
-    groups: tuple[Group, ...]
+    groups: tuple[Group, ...]  # the groups, the largest first
+    # the crashes without a crash type, each with the reason, such as a missing or damaged log
     left_out: tuple[str, ...] = ()
 
 

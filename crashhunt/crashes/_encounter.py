@@ -45,43 +45,27 @@ Manner = Literal["ahead", "behind", "oncoming", "crossing from the left", "cross
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """The position and speed of the other actor relative to the agent after one step.
+    """The position and speed of the other actor relative to the agent after one step."""
 
-    Args:
-        step: number of the step in the episode.
-        time_s: simulation time after the step, in s.
-        speed: speed of the agent, in m/s.
-        other_speed: speed of the other actor, in m/s.
-        gap_m: gap between the outlines of the two actors, in m.
-        closing_speed: speed at which the centres of the actors approach each other, in m/s; negative if they move
-            apart.
-        time_to_collision_s: time to collision at constant velocities, in s; infinite if the actors would miss each
-            other.
-        required_deceleration: deceleration that the agent would need to avoid a collision, v / (2 TTC) with v the
-            relative speed, in m/s².
-    """
-
-    step: int
-    time_s: float
-    speed: float
-    other_speed: float
-    gap_m: float
+    step: int  # number of the step in the episode
+    time_s: float  # simulation time after the step, in s
+    speed: float  # speed of the agent, in m/s
+    other_speed: float  # speed of the other actor, in m/s
+    gap_m: float  # gap between the outlines of the two actors, in m
+    # speed at which the centres of the actors approach each other, in m/s; negative if they move apart
     closing_speed: float
+    # time to collision at constant velocities, in s; infinite if the actors would miss each other
     time_to_collision_s: float
+    # deceleration that the agent would need to avoid a collision, v / (2 TTC) with v the relative speed, in m/s²
     required_deceleration: float
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """The position of the other actor relative to the agent.
+    """The position of the other actor relative to the agent."""
 
-    Args:
-        place: side of the agent on which the other actor is.
-        turn: heading of the other actor minus the heading of the agent, in rad, from -pi to pi.
-    """
-
-    place: Literal["ahead", "behind", "left", "right"]
-    turn: float
+    place: Literal["ahead", "behind", "left", "right"]  # side of the agent on which the other actor is
+    turn: float  # heading of the other actor minus the heading of the agent, in rad, from -pi to pi
 
     @property
     def faces(self) -> Literal["same", "other", "left", "right"]:
@@ -327,30 +311,23 @@ class DangerCourse:
 
     The criticality is NaN in steps without the agent. Instead of 0, the criticality is also NaN within the last 4 s,
     because later steps that are not recorded could raise it.
-
-    Args:
-        agent: identifier of the agent.
-        steps: numbers of the steps that have a scene.
-        own: The agent's criticality in each of these steps, towards actors ahead of it or crossing its path.
-        behind: The rear criticality in each of these steps, caused by actors that approach the agent from behind.
-        greatest: the moment of the agent's greatest own criticality.
-        greatest_behind: the moment of the greatest criticality caused by an actor behind the agent; ``other`` is this
-            actor.
-        nearest: identifier of the actor that came nearest to the agent, the gap in m, and the step; None if no actor
-            came within 50 m.
-        own_total: integral of the agent's own criticality over the trial, from 0 to below 1. Trials without a crash and
-            with one agent are ranked by this number.
-        behind_total: integral of the rear criticality over the trial, from 0 to below 1.
     """
 
-    agent: str
-    steps: range
+    agent: str  # identifier of the agent
+    steps: range  # numbers of the steps that have a scene
+    # the agent's criticality in each of these steps, towards actors ahead of it or crossing its path
     own: NDArray[np.float64]
+    # the rear criticality in each of these steps, caused by actors that approach the agent from behind
     behind: NDArray[np.float64]
-    greatest: DangerousMoment
+    greatest: DangerousMoment  # the moment of the agent's greatest own criticality
+    # the moment of the greatest criticality caused by an actor behind the agent; ``other`` is this actor
     greatest_behind: DangerousMoment
+    # integral of the agent's own criticality over the trial, from 0 to below 1. Trials without a crash and with one
+    # agent are ranked by this number.
     own_total: float
-    behind_total: float
+    behind_total: float  # integral of the rear criticality over the trial, from 0 to below 1
+    # identifier of the actor that came nearest to the agent, the gap in m, and the step; None if no actor came within
+    # 50 m
     nearest: tuple[str, float, int] | None = None
 
     def of_step(self, step: int) -> tuple[float, float] | None:

@@ -53,19 +53,12 @@ _RED_S = 8.0  # s: a vehicle that ran a red light has left the junction after th
 
 @dataclass(frozen=True, slots=True)
 class FaultFinding(Serializable):
-    """The verdict of a fault rule.
+    """The verdict of a fault rule."""
 
-    Args:
-        rule: name of the rule.
-        blames: The party at fault: ``ego``, the other actor, or both.
-        words: the evidence, as a clause of a sentence.
-        source: source of the rule, such as a law or a paper.
-    """
-
-    rule: str
-    blames: Blame
-    words: str
-    source: str
+    rule: str  # name of the rule
+    blames: Blame  # the party at fault: ``ego``, the other actor, or both
+    words: str  # the evidence, as a clause of a sentence
+    source: str  # source of the rule, such as a law or a paper
 
     json_keys = ("rule", "blames=blamed", "words", "source")
 
@@ -334,14 +327,10 @@ _DECISIVE_RULES = ("red light", "wrong way")
 
 @dataclass(frozen=True, slots=True)
 class Fault(Serializable):
-    """The vehicle at fault for a crash.
+    """The vehicle at fault for a crash."""
 
-    Args:
-        verdict: the vehicle at fault; ``ego`` is the controlled vehicle that crashed.
-        findings: The verdicts of the rules; they contradict each other in some undecided cases.
-    """
-
-    verdict: Verdict
+    verdict: Verdict  # the vehicle at fault; ``ego`` is the controlled vehicle that crashed
+    # the verdicts of the rules; they contradict each other in some undecided cases
     findings: tuple[FaultFinding, ...] = ()
 
     json_keys = ("verdict", "findings")

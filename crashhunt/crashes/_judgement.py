@@ -25,72 +25,51 @@ Without = Literal["same", "other", "none", "unclear"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceRun(Serializable):
-    """One run in which a reference driver controls a part of the agent's driving.
+    """One run in which a reference driver controls a part of the agent's driving."""
 
-    Args:
-        faculty: the controlled part: ``longitudinal``, ``lateral`` or ``both``.
-        step: the step after which the reference driver takes control.
-        ending: what happened to the crash: ``none``, ``same``, ``other`` or ``unclear``.
-        changed: further differences from the recorded crash, such as ``ego does not change lanes``.
-    """
-
-    faculty: str
-    step: int
-    ending: Without
-    changed: tuple[str, ...] = ()
+    faculty: str  # the controlled part: ``longitudinal``, ``lateral`` or ``both``
+    step: int  # the step after which the reference driver takes control
+    ending: Without  # what happened to the crash: ``none``, ``same``, ``other`` or ``unclear``
+    changed: tuple[str, ...] = ()  # further differences from the recorded crash, such as ``ego does not change lanes``
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Omission(Serializable):
-    """An omission: something that the agent failed to do. In every run without the omission, there is no crash.
+    """An omission: something that the agent failed to do. In every run without the omission, there is no crash."""
 
-    Args:
-        faculty: the part of the driving with which a reference driver avoids the crash: ``longitudinal``, ``lateral``
-            or ``both``.
-        kind: what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing`` (an actor with a
-            crossing path). In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
-        actor: identifier of the disregarded actor; empty for a red light and for a missing lane.
-        step: the step after which the omission began.
-        instead: what the agent did instead: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed
-            lanes``. Whether it sped up is decided over the last 2 s before the crash.
-        speed_mps: speed of the agent after that step, in m/s.
-        actor_speed_mps: speed of the disregarded actor, in m/s; None if there is no such actor.
-        gap_m: gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. The
-            gap is None if there is neither an actor nor a stop line.
-        safe: the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane.
-        visible_step: the step after which an observation first contained the actor; None if the step is unknown.
-        last_speed_mps: speed of the agent just before the crash, in m/s; None for a lane change, or if it is unknown.
-        kept_s: time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s. It does
-            not exceed the time since the omission began. None for a lane change, or if it is unknown.
-    """
-
+    # the part of the driving with which a reference driver avoids the crash: ``longitudinal``, ``lateral`` or ``both``
     faculty: str
+    # what the agent disregarded. On its path: ``vehicle``, ``red light`` or ``crossing`` (an actor with a crossing
+    # path). In a lane change: ``ahead``, ``behind``, ``alongside`` or ``no lane``, followed by the side.
     kind: str
-    actor: str
-    step: int
+    actor: str  # identifier of the disregarded actor; empty for a red light and for a missing lane
+    step: int  # the step after which the omission began
+    # what the agent did instead: ``sped up``, ``kept its speed``, ``braked too little`` or ``changed lanes``. Whether
+    # it sped up is decided over the last 2 s before the crash.
     instead: str
-    speed_mps: float
-    actor_speed_mps: float | None = None
+    speed_mps: float  # speed of the agent after that step, in m/s
+    actor_speed_mps: float | None = None  # speed of the disregarded actor, in m/s; None if there is no such actor
+    # gap between the agent and the actor or stop line, in m; negative if the vehicles are side by side. The gap is None
+    # if there is neither an actor nor a stop line.
     gap_m: float | None = None
+    # the safe speed for that gap, in m/s; for a lane change, the safe gap in m; None for a missing lane
     safe: float | None = None
+    # the step after which an observation first contained the actor; None if the step is unknown
     visible_step: int | None = None
+    # speed of the agent just before the crash, in m/s; None for a lane change, or if it is unknown
     last_speed_mps: float | None = None
+    # time until the crash over which the agent's speed stayed within 0.5 m/s of the last speed, in s. It does not
+    # exceed the time since the omission began. None for a lane change, or if it is unknown.
     kept_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference(Serializable):
-    """The results of the runs with a reference driver.
+    """The results of the runs with a reference driver."""
 
-    Args:
-        omission: the omission that caused the crash; None if the runs show none.
-        runs: all runs in which a reference driver acted.
-        why_not: why the result is missing or incomplete; empty if it is complete.
-    """
-
-    omission: Omission | None = None
-    runs: tuple[ReferenceRun, ...] = ()
-    why_not: str = ""
+    omission: Omission | None = None  # the omission that caused the crash; None if the runs show none
+    runs: tuple[ReferenceRun, ...] = ()  # all runs in which a reference driver acted
+    why_not: str = ""  # why the result is missing or incomplete; empty if it is complete
 
     @property
     def deciding(self) -> tuple[ReferenceRun, ...]:
@@ -110,45 +89,31 @@ COMPETENT_DRIVERS = ("cc_human", "fsm", "rss", "reg157")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriverRun(Serializable):
-    """The answer of one model of a competent driver.
+    """The answer of one model of a competent driver."""
 
-    Args:
-        model: name of the model.
-        prevented: whether the run with this model ends without the collision; None if the model does not apply or the
-            run does not decide it.
-        why_not: why there is no answer; empty if there is one.
-        perceived_step: the step after which the model perceived the risk; None if it never did, or did not run.
-        gap_m: gap between the vehicles when the model perceived the risk, in m.
-        speed_mps: speed of the agent then, in m/s.
-        other_speed_mps: speed of the other vehicle then, in m/s.
-        margin_m: the smallest gap to the other vehicle in the own path after that, in m; None if there is no answer,
-            or the collision was not prevented.
-    """
-
-    model: str
+    model: str  # name of the model
+    # whether the run with this model ends without the collision; None if the model does not apply or the run does not
+    # decide it
     prevented: bool | None = None
-    why_not: str = ""
+    why_not: str = ""  # why there is no answer; empty if there is one
+    # the step after which the model perceived the risk; None if it never did, or did not run
     perceived_step: int | None = None
-    gap_m: float | None = None
-    speed_mps: float | None = None
-    other_speed_mps: float | None = None
+    gap_m: float | None = None  # gap between the vehicles when the model perceived the risk, in m
+    speed_mps: float | None = None  # speed of the agent then, in m/s
+    other_speed_mps: float | None = None  # speed of the other vehicle then, in m/s
+    # the smallest gap to the other vehicle in the own path after that, in m; None if there is no answer, or the
+    # collision was not prevented
     margin_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preventability(Serializable):
-    """The answers of all models of a competent driver for one collision.
+    """The answers of all models of a competent driver for one collision."""
 
-    Args:
-        since_step: the step after which the models watch the other vehicle: the first step at which the agent could
-            see it.
-        runs: the answer of each model.
-        why_not: why no model applies; empty if at least one does.
-    """
-
+    # the step after which the models watch the other vehicle: the first step at which the agent could see it
     since_step: int = 0
-    runs: tuple[DriverRun, ...] = ()
-    why_not: str = ""
+    runs: tuple[DriverRun, ...] = ()  # the answer of each model
+    why_not: str = ""  # why no model applies; empty if at least one does
 
     @property
     def answers(self) -> dict[str, bool | None]:
@@ -176,44 +141,31 @@ _Z = 1.959963984540054  # of 95 % confidence
 
 @dataclass(frozen=True, slots=True)
 class LeftOut(Serializable):
-    """One run without a suspected cause.
+    """One run without a suspected cause."""
 
-    Args:
-        given: The other value of an argument or seed; for every other factor, the step after which the factor was
-            suppressed.
-        ending: The outcome of the run.
-        into: The actor that was hit by a vehicle whose speed was held constant; empty if there was none.
-        changed: Further differences in the agent's behaviour in the run, such as ``ego does not change lanes``.
-    """
-
+    # the other value of an argument or seed; for every other factor, the step after which the factor was suppressed
     given: Value
-    ending: Without
-    into: str = ""
+    ending: Without  # the outcome of the run
+    into: str = ""  # the actor that was hit by a vehicle whose speed was held constant; empty if there was none
+    # further differences in the agent's behaviour in the run, such as ``ego does not change lanes``
     changed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Factor(Serializable):
-    """A possible cause of a crash, and the runs without it.
+    """A possible cause of a crash, and the runs without it."""
 
-    Args:
-        kind: type of the factor: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or
-            ``agent``.
-        name: name of the argument or actor.
-        what: for an argument ``default`` or ``drawn``; for a disturbance its type; else ``braked``, ``sped up``,
-            ``changed lanes``, or ``there`` if the presence of the actor is the factor.
-        step: the step after which the actor did this, or at which the disturbance began; None for arguments and seeds.
-        was: the value of an argument or a seed, or the speed in m/s at which a vehicle was held; None if neither
-            applies.
-        runs: the runs without the factor.
-    """
-
+    # type of the factor: ``argument``, ``seed``, ``disturbance``, ``other`` (a manoeuvre of another actor) or ``agent``
     kind: str
-    name: str
+    name: str  # name of the argument or actor
+    # for an argument ``default`` or ``drawn``; for a disturbance its type; else ``braked``, ``sped up``, ``changed
+    # lanes``, or ``there`` if the presence of the actor is the factor
     what: str
+    # the step after which the actor did this, or at which the disturbance began; None for arguments and seeds
     step: int | None = None
+    # the value of an argument or a seed, or the speed in m/s at which a vehicle was held; None if neither applies
     was: Value | None = None
-    runs: tuple[LeftOut, ...] = ()
+    runs: tuple[LeftOut, ...] = ()  # the runs without the factor
 
     json_keys = ("kind", "name", "what", "step", "was", "runs", "clear", "crashed", "same", "interval", "needed")
 
@@ -247,19 +199,12 @@ class Factor(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Why(Serializable):
-    """The results of a counterfactual analysis.
+    """The results of a counterfactual analysis."""
 
-    Args:
-        factors: the factors, in the order in which they were examined.
-        steps: number of steps after which a run with other arguments or seeds ended if it did not crash.
-        left: number of further runs that were skipped because of the limit.
-        why_not: why the answer is missing or incomplete; empty if the answer is complete.
-    """
-
-    factors: tuple[Factor, ...] = ()
-    steps: int = 0
-    left: int = 0
-    why_not: str = ""
+    factors: tuple[Factor, ...] = ()  # the factors, in the order in which they were examined
+    steps: int = 0  # number of steps after which a run with other arguments or seeds ended if it did not crash
+    left: int = 0  # number of further runs that were skipped because of the limit
+    why_not: str = ""  # why the answer is missing or incomplete; empty if the answer is complete
 
     json_keys = ("factors", "runs", "steps", "left", "why_not")
 
@@ -299,21 +244,14 @@ avoidable, so the trial says nothing about the agent. The verdict ``unknown`` me
 
 @dataclass(frozen=True, slots=True)
 class Attempt(Serializable):
-    """One evasive manoeuvre, tried from several steps on.
+    """One evasive manoeuvre, tried from several steps on."""
 
-    Args:
-        manoeuvre: name of the manoeuvre, as in `Overruled`.
-        end: number of the step in which the crash happened.
-        endings: what happened to the crash, by the step after which the agent was overruled.
-        deceleration: the greatest deceleration in the runs that avoided the crash, in m/s²; None if the vehicle never
-            slowed down.
-        changed: Further differences in the agent's behaviour, in the run from the last step that avoids the crash.
-    """
-
-    manoeuvre: str
-    end: int
-    endings: Mapping[int, Ending]
+    manoeuvre: str  # name of the manoeuvre, as in `Overruled`
+    end: int  # number of the step in which the crash happened
+    endings: Mapping[int, Ending]  # what happened to the crash, by the step after which the agent was overruled
+    # the greatest deceleration in the runs that avoided the crash, in m/s²; None if the vehicle never slowed down
     deceleration: float | None = None
+    # further differences in the agent's behaviour, in the run from the last step that avoids the crash
     changed: tuple[str, ...] = ()
 
     json_keys = (
@@ -352,24 +290,15 @@ class Attempt(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class Judgement(Serializable):
-    """The results for all evasive manoeuvres of the agent; every result comes from a run.
+    """The results for all evasive manoeuvres of the agent; every result comes from a run."""
 
-    Args:
-        attempts: the results, one for each manoeuvre.
-        why_not: why the answer is missing or incomplete; empty if the answer is complete.
-        why: The causes of the collision; None if they were not examined.
-        visible_step: The step after which an observation of the agent first contained the collision partner; None if
-            that is unknown.
-        reference: The results of runs with a reference driver; None if there were no such runs.
-        drivers: The answers of models of a competent driver; None if they were not asked.
-    """
-
-    attempts: tuple[Attempt, ...] = ()
-    why_not: str = ""
-    why: Why | None = None
+    attempts: tuple[Attempt, ...] = ()  # the results, one for each manoeuvre
+    why_not: str = ""  # why the answer is missing or incomplete; empty if the answer is complete
+    why: Why | None = None  # the causes of the collision; None if they were not examined
+    # the step after which an observation of the agent first contained the collision partner; None if that is unknown
     visible_step: int | None = None
-    reference: Reference | None = None
-    drivers: Preventability | None = None
+    reference: Reference | None = None  # the results of runs with a reference driver; None if there were no such runs
+    drivers: Preventability | None = None  # the answers of models of a competent driver; None if they were not asked
 
     json_keys = (
         "avoidable", "manoeuvre", "last_step=best.last_step", "runs", "why_not", "attempts", "verdict", "visible_step",

@@ -34,24 +34,16 @@ _MAX_TAGS = 20  # of one note
 
 @dataclass(frozen=True, slots=True)
 class Note(Serializable):
-    """A remark of a user on a hunt or on one of its crashes.
+    """A remark of a user on a hunt or on one of its crashes."""
 
-    Args:
-        number: number of the note in the hunt, counted from 1. The number of a removed note is not used again.
-        crash: identifier of the crash or near miss; empty if the note is about the whole hunt. The folder precedes the
-            identifier of a crash that a fork has found, such as ``probes/000012-collision``.
-        at: time at which the note was added, such as ``2026-11-28 18:05:00 UTC``.
-        by: name of the user.
-        text: text of the note; may be empty if the note has tags.
-        tags: tags of the note.
-    """
-
-    number: int
+    number: int  # number of the note in the hunt, counted from 1. The number of a removed note is not used again.
+    # identifier of the crash or near miss; empty if the note is about the whole hunt. The folder precedes the
+    # identifier of a crash that a fork has found, such as ``probes/000012-collision``.
     crash: str
-    at: str
-    by: str
-    text: str
-    tags: tuple[str, ...] = ()
+    at: str  # time at which the note was added, such as ``2026-11-28 18:05:00 UTC``
+    by: str  # name of the user
+    text: str  # text of the note; may be empty if the note has tags
+    tags: tuple[str, ...] = ()  # tags of the note
 
     def matches(self, words: Iterable[str]) -> bool:
         """Return whether each of the words occurs in the text, the tags, the crash or the user; case is ignored."""

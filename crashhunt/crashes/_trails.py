@@ -25,17 +25,11 @@ _REAR_M = 1.5  # from the rear of a vehicle, along its path: further ahead, its 
 
 @dataclass(frozen=True)
 class Trail:
-    """The path of an actor's front up to the contact, the earliest pose first.
+    """The path of an actor's front up to the contact, the earliest pose first."""
 
-    Args:
-        points: x and y of the front bumper, shape (n, 2), in m.
-        headings: headings of the actor, shape (n,), in rad.
-        length: length of the actor, in m.
-    """
-
-    points: NDArray[np.float64]
-    headings: NDArray[np.float64]
-    length: float
+    points: NDArray[np.float64]  # x and y of the front bumper, shape (n, 2), in m
+    headings: NDArray[np.float64]  # headings of the actor, shape (n,), in rad
+    length: float  # length of the actor, in m
 
     @cached_property
     def to_go(self) -> NDArray[np.float64]:
@@ -100,17 +94,11 @@ class Trail:
 
 @dataclass(frozen=True, slots=True)
 class SharedPath:
-    """The end of an actor's path, which leads along the path that another actor had driven before.
+    """The end of an actor's path, which leads along the path that another actor had driven before."""
 
-    Args:
-        aside_m: distance of the actor's front from the path of the other actor at the contact, in m.
-        behind_m: how far the front of the actor is behind the front of the other one, along the path, in m.
-        length: length of the other actor, in m.
-    """
-
-    aside_m: float
-    behind_m: float
-    length: float
+    aside_m: float  # distance of the actor's front from the path of the other actor at the contact, in m
+    behind_m: float  # how far the front of the actor is behind the front of the other one, along the path, in m
+    length: float  # length of the other actor, in m
 
     @property
     def meets_rear(self) -> bool:
