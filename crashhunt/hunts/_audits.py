@@ -154,11 +154,7 @@ _AUDIT_FOLDER = "audits"  # of the scratch folder
 
 
 class PendingAudits:
-    """The sampled trials that earlier runs of a hunt have not run again.
-
-    Attributes:
-        numbers: numbers of these trials.
-    """
+    """The sampled trials that earlier runs of a hunt have not run again."""
 
     def __init__(self, ledger: Ledger, before: Facts, settings: WorkerSettings) -> None:
         left = set(before.get("audits_left") or ()) if settings.audit > 0.0 else set()
@@ -166,7 +162,7 @@ class PendingAudits:
             # It was killed; what ended after its last heartbeat is not noted.
             ended = ledger.results_where("ended_at >= ?", before.get("heartbeat", 0.0))
             left |= {result.spec.number for result in ended if settings.is_audited(result)}
-        self.numbers = sorted(left)
+        self.numbers = sorted(left)  # numbers of these trials
 
     def note(self, audit: Audit, progress: Progress) -> None:
         """Add the result of the audit, and the trials left of all audits, to the progress of the hunt."""

@@ -242,9 +242,6 @@ class RunningHunt:
         ledger: ledger of the hunt, open for writing.
         watch: function called with the progress about ten times a second.
 
-    Attributes:
-        has_begun: whether the ledger says that the hunt runs, with all facts of `progress`.
-
     Raises:
         CrashhuntError: the hunt cannot resume.
     """
@@ -252,7 +249,7 @@ class RunningHunt:
     def __init__(self, setup: HuntSetup, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> None:
         settings, code = setup.settings, setup.code
         self.setup, self.ledger, self._watch = setup, ledger, watch
-        self.has_begun = False
+        self.has_begun = False  # whether the ledger says that the hunt runs, with all facts of `progress`
         self._sampler = sampler_of(settings)
         self.disturber = disturber_apart(setup.scenario, settings)
         self.progress = Progress(notes=setup.notes)

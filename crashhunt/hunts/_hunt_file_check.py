@@ -31,47 +31,31 @@ _MAX_OPEN_FILES = 4  # at a time: a folder, and the ledger with its write-ahead 
 
 @dataclass(frozen=True, slots=True)
 class CheckFinding(Serializable):
-    """A problem that the check has found.
+    """A problem that the check has found."""
 
-    Args:
-        where: path of the file or folder.
-        what: description of the problem.
-        lost: the data that are lost, as text; empty if nothing is lost.
-        fix: how to recover the remaining data.
-        damaged: whether the problem is damage; otherwise it is harmless.
-    """
-
-    where: str
-    what: str
-    lost: str = ""
-    fix: str = ""
-    damaged: bool = True
+    where: str  # path of the file or folder
+    what: str  # description of the problem
+    lost: str = ""  # the data that are lost, as text; empty if nothing is lost
+    fix: str = ""  # how to recover the remaining data
+    damaged: bool = True  # whether the problem is damage; otherwise it is harmless
 
 
 @dataclass(slots=True)
 class Checked(Serializable):
-    """The result of the check of a hunt, a crash or an exported crash.
+    """The result of the check of a hunt, a crash or an exported crash."""
 
-    Args:
-        dir: path of the hunt or crash.
-        kind: either ``hunt``, ``crash`` or ``file``.
-        trials: the numbers of the trials whose rows are unchanged since they were written.
-        damaged_trials: reason for each damaged trial.
-        crashes: the names of the bundles that are unchanged since they were written.
-        near_misses: the names of the bundles of near misses among them, and of a hunt.
-        damaged_crashes: reason for each damaged crash.
-        findings: the problems that were found.
-        dropped: the trials whose bundles were deleted, because shorter crashes of their type were kept.
-    """
-
-    dir: Path
-    kind: Literal["hunt", "crash", "file"] = "hunt"
+    dir: Path  # path of the hunt or crash
+    kind: Literal["hunt", "crash", "file"] = "hunt"  # either ``hunt``, ``crash`` or ``file``
+    # the numbers of the trials whose rows are unchanged since they were written
     trials: set[int] = field(default_factory=set)
-    damaged_trials: set[int] = field(default_factory=set)
+    damaged_trials: set[int] = field(default_factory=set)  # reason for each damaged trial
+    # the names of the bundles that are unchanged since they were written
     crashes: list[str] = field(default_factory=list)
+    # the names of the bundles of near misses among them, and of a hunt
     near_misses: list[str] = field(default_factory=list)
-    damaged_crashes: list[str] = field(default_factory=list)
-    findings: list[CheckFinding] = field(default_factory=list)
+    damaged_crashes: list[str] = field(default_factory=list)  # reason for each damaged crash
+    findings: list[CheckFinding] = field(default_factory=list)  # the problems that were found
+    # the trials whose bundles were deleted, because shorter crashes of their type were kept
     dropped: set[int] = field(default_factory=set)
 
     json_keys = (

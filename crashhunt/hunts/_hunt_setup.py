@@ -33,35 +33,20 @@ _MAX_ADDED_SHOWN = 4  # new files
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HuntSetup:
-    """The parts of a hunt that do not change while it runs.
+    """The parts of a hunt that do not change while it runs."""
 
-    Args:
-        place: directory of the hunt, which is locked.
-        scenario: scenario of the trials.
-        settings: settings of the hunt.
-        workers: settings of the processes that run its trials.
-        snapshot: snapshot of the code that runs.
-        code: the versions of the code of all its trials.
-        is_new_code: whether the code differs from that of the latest trials.
-        imported: the modules that trials import; None if they are unknown.
-        pace: limit on how far the hunt is ahead of its partner; None without a partner.
-        stops: the signals that request the hunt to stop, as they arrive.
-        conditions: the conditions under which trials can run on this machine.
-        notes: notices for the user.
-    """
-
-    place: HuntDirectory
-    scenario: Scenario
-    settings: HuntSettings
-    workers: WorkerSettings
-    snapshot: Snapshot
-    code: CodeVersions
-    is_new_code: bool
-    imported: ImportedModules | None
-    pace: Pace | None
-    stops: Sequence[int]
-    conditions: HostConditions
-    notes: list[str] = field(default_factory=list)
+    place: HuntDirectory  # directory of the hunt, which is locked
+    scenario: Scenario  # scenario of the trials
+    settings: HuntSettings  # settings of the hunt
+    workers: WorkerSettings  # settings of the processes that run its trials
+    snapshot: Snapshot  # snapshot of the code that runs
+    code: CodeVersions  # the versions of the code of all its trials
+    is_new_code: bool  # whether the code differs from that of the latest trials
+    imported: ImportedModules | None  # the modules that trials import; None if they are unknown
+    pace: Pace | None  # limit on how far the hunt is ahead of its partner; None without a partner
+    stops: Sequence[int]  # the signals that request the hunt to stop, as they arrive
+    conditions: HostConditions  # the conditions under which trials can run on this machine
+    notes: list[str] = field(default_factory=list)  # notices for the user
 
     @property
     def parallel_here(self) -> int:

@@ -38,37 +38,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StrategyStatus:
-    """The trials of one strategy of the sampler.
+    """The trials of one strategy of the sampler."""
 
-    Args:
-        name: name of the strategy.
-        trials: number of finished trials that the strategy proposed.
-        share: share of all finished trials, from 0 to 1.
-        danger: mean criticality of the strategy's trials, from 0 to 1, in which a crash counts as 1; None if it is
-            unknown.
-        crashes: number of crashes among the strategy's trials.
-    """
-
-    name: str
-    trials: int
-    share: float
+    name: str  # name of the strategy
+    trials: int  # number of finished trials that the strategy proposed
+    share: float  # share of all finished trials, from 0 to 1
+    # mean criticality of the strategy's trials, from 0 to 1, in which a crash counts as 1; None if it is unknown
     danger: float | None
-    crashes: int
+    crashes: int  # number of crashes among the strategy's trials
 
 
 @dataclass(frozen=True, slots=True)
 class SearchStatus:
-    """Progress of the search, for the status screen.
+    """Progress of the search, for the status screen."""
 
-    Args:
-        strategies: strategies that have proposed trials, the most frequent first; empty if the sampler reports no
-            strategies.
-        grown_trials: number of trials since the greatest criticality last rose; None if it did not rise in this run.
-        grown_s: time since the greatest criticality last rose, in s of wall time; None if it did not rise in this run.
-    """
-
+    # strategies that have proposed trials, the most frequent first; empty if the sampler reports no strategies
     strategies: tuple[StrategyStatus, ...] = ()
+    # number of trials since the greatest criticality last rose; None if it did not rise in this run
     grown_trials: int | None = None
+    # time since the greatest criticality last rose, in s of wall time; None if it did not rise in this run
     grown_s: float | None = None
 
 
@@ -137,60 +125,40 @@ class StrategyTally:
 
 @dataclass(frozen=True, slots=True)
 class HuntStatus:
-    """The progress of a hunt, for the status screen.
+    """The progress of a hunt, for the status screen."""
 
-    Args:
-        phase: the current phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`. During
-            ``waiting``, another program locks the ledger.
-        planned: total number of trials; 0 if only the time is limited.
-        done: number of finished trials, including those of earlier runs of the hunt.
-        outcomes: number of trials with each outcome.
-        rate_per_s: trials per second in this run of the hunt.
-        elapsed_s: wall time of this run of the hunt, in s.
-        nearest: the trial without a crash that came nearest to a crash.
-        workers: progress of each running trial, by number.
-        crashes: number of crashes, with or without a bundle.
-        nodes: the machines that currently run trials; None if only this machine does.
-        kinds: crash types, the most frequent first; None if the hunt ends at its first crash.
-        newest_kind_s: time since the last new crash type, in s; None if unknown.
-        newest_kind_trials: number of trials since the last new crash type; None if an earlier run of the hunt found it.
-        types_by_cause: number of crash types by cause; None if the hunt counts types.
-        time_left_s: time until no more trials begin, in s of wall time; infinite without a limit.
-        disturbed: number of crashes with disturbances; None if the hunt has no disturbances.
-        stressed: the trial with the smallest robustness margin; None if there were no probes, or if no probe crashed.
-        branched: number of branches that have crashed.
-        not_fully_asked: number of trials in which a probe or branch has no result.
-        search: trials of each strategy, and the last rise of the greatest criticality in this run.
-        rate: the current crash rate; None if there is none.
-        trials_left_s: time until the last trial ends, in s of wall time; None to estimate it from the mean rate.
-        progress: progress of the work after the last trial; None before that.
-        steps: number of steps that the trials of this run of the hunt have simulated, without warm-up.
-    """
-
+    # the current phase: ``hunting``, ``saving``, ``auditing``, ``done``, or a name of `PhaseStatus`. During
+    # ``waiting``, another program locks the ledger.
     phase: str
-    planned: int
-    done: int
-    outcomes: dict[str, int]
-    rate_per_s: float
-    elapsed_s: float
-    nearest: TrialResult | None
-    workers: dict[int, BlackBoxHeader]
-    crashes: int
+    planned: int  # total number of trials; 0 if only the time is limited
+    done: int  # number of finished trials, including those of earlier runs of the hunt
+    outcomes: dict[str, int]  # number of trials with each outcome
+    rate_per_s: float  # trials per second in this run of the hunt
+    elapsed_s: float  # wall time of this run of the hunt, in s
+    nearest: TrialResult | None  # the trial without a crash that came nearest to a crash
+    workers: dict[int, BlackBoxHeader]  # progress of each running trial, by number
+    crashes: int  # number of crashes, with or without a bundle
+    # the machines that currently run trials; None if only this machine does
     nodes: tuple[NodeFigures, ...] | None = None
+    # crash types, the most frequent first; None if the hunt ends at its first crash
     kinds: tuple[Group, ...] | None = None
-    newest_kind_s: float | None = None
+    newest_kind_s: float | None = None  # time since the last new crash type, in s; None if unknown
+    # number of trials since the last new crash type; None if an earlier run of the hunt found it
     newest_kind_trials: int | None = None
-    types_by_cause: int | None = None
-    time_left_s: float = math.inf
-    disturbed: int | None = None
+    types_by_cause: int | None = None  # number of crash types by cause; None if the hunt counts types
+    time_left_s: float = math.inf  # time until no more trials begin, in s of wall time; infinite without a limit
+    disturbed: int | None = None  # number of crashes with disturbances; None if the hunt has no disturbances
+    # the trial with the smallest robustness margin; None if there were no probes, or if no probe crashed
     stressed: TrialResult | None = None
-    branched: int = 0
-    not_fully_asked: int = 0
+    branched: int = 0  # number of branches that have crashed
+    not_fully_asked: int = 0  # number of trials in which a probe or branch has no result
+    # trials of each strategy, and the last rise of the greatest criticality in this run
     search: SearchStatus = field(default_factory=SearchStatus)
-    rate: RunningRate | None = None
+    rate: RunningRate | None = None  # the current crash rate; None if there is none
+    # time until the last trial ends, in s of wall time; None to estimate it from the mean rate
     trials_left_s: float | None = None
-    progress: PhaseStatus | None = None
-    steps: int = 0
+    progress: PhaseStatus | None = None  # progress of the work after the last trial; None before that
+    steps: int = 0  # number of steps that the trials of this run of the hunt have simulated, without warm-up
 
     @property
     def seconds_left(self) -> float:
@@ -534,19 +502,12 @@ class RemainingTime:
 
 @dataclass(frozen=True, slots=True)
 class PhaseStatus(Serializable):
-    """Progress of a phase of a hunt.
+    """Progress of a phase of a hunt."""
 
-    Args:
-        name: name of the phase.
-        done: number of finished runs.
-        total: total number of runs.
-        seconds_left: time until the phase ends, in s; None if it is unknown.
-    """
-
-    name: PhaseName
-    done: int
-    total: int
-    seconds_left: float | None
+    name: PhaseName  # name of the phase
+    done: int  # number of finished runs
+    total: int  # total number of runs
+    seconds_left: float | None  # time until the phase ends, in s; None if it is unknown
 
 
 class PhaseClock:

@@ -24,23 +24,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Difference(Serializable):
-    """The first difference between a trial and its run in a new process.
+    """The first difference between a trial and its run in a new process."""
 
-    Args:
-        trial: number of the trial.
-        step: the first step that differs; None if only the digests were compared, because no recording was kept.
-        agent: identifier of the agent or actor; empty if the difference concerns neither.
-        field: name of the value that differs.
-        recorded: the value in the hunt.
-        replayed: the value in the new process.
-    """
-
-    trial: int
+    trial: int  # number of the trial
+    # the first step that differs; None if only the digests were compared, because no recording was kept
     step: int | None
-    agent: str
-    field: str
-    recorded: object
-    replayed: object
+    agent: str  # identifier of the agent or actor; empty if the difference concerns neither
+    field: str  # name of the value that differs
+    recorded: object  # the value in the hunt
+    replayed: object  # the value in the new process
 
     def __str__(self) -> str:
         whose = f" of {self.agent}" if self.agent else ""
@@ -53,43 +45,30 @@ class Difference(Serializable):
 
 @dataclass(frozen=True, slots=True)
 class AuditReport(Serializable):
-    """The result of an audit, which runs trials without a crash again in new processes.
+    """The result of an audit, which runs trials without a crash again in new processes."""
 
-    Args:
-        trials: number of trials that were run again to their end.
-        differences: the first difference of each trial that differed.
-        not_finished: number of trials whose second run did not reach its end.
-    """
-
-    trials: int = 0
-    differences: tuple[Difference, ...] = ()
-    not_finished: int = 0
+    trials: int = 0  # number of trials that were run again to their end
+    differences: tuple[Difference, ...] = ()  # the first difference of each trial that differed
+    not_finished: int = 0  # number of trials whose second run did not reach its end
 
     json_keys = ("trials", "not_finished", "differences")
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeReport:
-    """The result of the robustness probes of a hunt.
+    """The result of the robustness probes of a hunt."""
 
-    Args:
-        sums: counts of all trials.
-        margins: the robustness margin of each trial whose probes all have a result.
-        why_unasked: why a probe has no result in the first trial in which not all probes have one; empty without such a
-            trial.
-        run_again: number of crashes with the mildest disturbance that were run from the start.
-        not_finished: number of runs from the start that did not reach their end, for example because they were killed.
-        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
-        by: the disturbance that the probe added in each trial of ``crashes``, with its actual values. The trial may
-            have drawn further disturbances.
-    """
-
-    sums: ProbeSums
-    margins: tuple[float, ...]
+    sums: ProbeSums  # counts of all trials
+    margins: tuple[float, ...]  # the robustness margin of each trial whose probes all have a result
+    # why a probe has no result in the first trial in which not all probes have one; empty without such a trial
     why_unasked: str
-    run_again: int
+    run_again: int  # number of crashes with the mildest disturbance that were run from the start
+    # number of runs from the start that did not reach their end, for example because they were killed
     not_finished: int
+    # runs from the start that crashed in the same way at the same step, and were confirmed bit-identically
     crashes: tuple[Bundle, ...]
+    # the disturbance that the probe added in each trial of ``crashes``, with its actual values. The trial may have
+    # drawn further disturbances.
     by: tuple[Disturbance, ...]
 
     def to_json(self) -> JsonObject:
@@ -109,21 +88,15 @@ class ProbeReport:
 
 @dataclass(frozen=True, slots=True)
 class BranchReport:
-    """The result of the branches of a hunt.
+    """The result of the branches of a hunt."""
 
-    Args:
-        sums: counts of all trials.
-        why_unanswered: why a branch has no result in the first trial in which not all branches have one; empty without
-            such a trial.
-        run_again: number of crashed branches that were run from the start: the likeliest branch of each trial.
-        not_finished: number of runs from the start that did not reach their end, for example because they were killed.
-        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
-    """
-
-    sums: BranchSums
+    sums: BranchSums  # counts of all trials
+    # why a branch has no result in the first trial in which not all branches have one; empty without such a trial
     why_unanswered: str
-    run_again: int
+    run_again: int  # number of crashed branches that were run from the start: the likeliest branch of each trial
+    # number of runs from the start that did not reach their end, for example because they were killed
     not_finished: int
+    # runs from the start that crashed in the same way at the same step, and were confirmed bit-identically
     crashes: tuple[Bundle, ...]
 
     def to_json(self) -> JsonObject:
@@ -134,19 +107,14 @@ class BranchReport:
 
 @dataclass(frozen=True, slots=True)
 class RareReport:
-    """The result of a hunt in rare mode.
+    """The result of a hunt in rare mode."""
 
-    Args:
-        estimate: estimate of the crash probability per trial.
-        run_again: number of crashes found by forks that were run again from the start. The crashes with the greatest
-            weights are chosen.
-        not_finished: number of runs from the start, requested for ``run_again``, that did not finish.
-        crashes: runs from the start that crashed in the same way at the same step, and were confirmed bit-identically.
-    """
-
-    estimate: RareEstimate
+    estimate: RareEstimate  # estimate of the crash probability per trial
+    # number of crashes found by forks that were run again from the start. The crashes with the greatest weights are
+    # chosen.
     run_again: int
-    not_finished: int
+    not_finished: int  # number of runs from the start, requested for ``run_again``, that did not finish
+    # runs from the start that crashed in the same way at the same step, and were confirmed bit-identically
     crashes: tuple[Bundle, ...]
 
     def to_json(self) -> JsonObject:

@@ -85,19 +85,12 @@ def above_zero(fix: str, *, finite: bool = True) -> Check:
 
 @dataclass(frozen=True, slots=True)
 class HuntOption:
-    """An option of `HuntOptions`, with its texts for Python and the command line.
+    """An option of `HuntOptions`, with its texts for Python and the command line."""
 
-    Args:
-        name: name in Python and in files.
-        form: how values are written: as a flag, a number, a text, a list or a table.
-        default: value if the user does not give the option.
-        about: the rest of the option's declaration.
-    """
-
-    name: str
-    form: Form
-    default: object
-    about: About
+    name: str  # name in Python and in files
+    form: Form  # how values are written: as a flag, a number, a text, a list or a table
+    default: object  # value if the user does not give the option
+    about: About  # the rest of the option's declaration
 
     @property
     def shown(self) -> str:

@@ -29,18 +29,13 @@ class Request(HuntOptions):
 
     The agents are their locators, and values of arguments are texts in the syntax of the command line.
 
-    Args:
-        parallel: number of trials at a time; 0 for one per core.
-        trials: maximum number of trials; 0 for no limit.
-        max_steps: maximum number of steps of a trial.
-
     Raises:
         UsageError: the agent is not in a module that workers can import, or a table is no dictionary.
     """
 
-    parallel: int = 1
-    trials: int
-    max_steps: int
+    parallel: int = 1  # number of trials at a time; 0 for one per core
+    trials: int  # maximum number of trials; 0 for no limit
+    max_steps: int  # maximum number of steps of a trial
 
     def __post_init__(self) -> None:
         """Write the only agent, and values that are not texts, in the form of the command line."""

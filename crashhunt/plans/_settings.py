@@ -39,15 +39,10 @@ _RUN_KEYS = (
 
 @dataclass(frozen=True, kw_only=True)
 class ArgumentSpec:
-    """The values that a hunt tries for one argument.
+    """The values that a hunt tries for one argument."""
 
-    Args:
-        spec: specification of the values, as in ``--arg NAME=SPEC``.
-        kind: the type of the values.
-    """
-
-    spec: str
-    kind: Kind | None = None
+    spec: str  # specification of the values, as in ``--arg NAME=SPEC``
+    kind: Kind | None = None  # the type of the values
 
     @property
     def distribution(self) -> Distribution:
@@ -57,18 +52,13 @@ class ArgumentSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSettings:
-    """The table ``[agents.ID]``: the agent of a vehicle and its argument values.
+    """The table ``[agents.ID]``: the agent of a vehicle and its argument values."""
 
-    Args:
-        agent: the agent, as in ``--agent``.
-        arguments: the values that the hunt tries for the agent's arguments.
-        action: the form of the actions, if requested.
-        observation: the parts that the agent observes, if the command line or the agent's class names parts.
-    """
-
-    agent: str
+    agent: str  # the agent, as in ``--agent``
+    # the values that the hunt tries for the agent's arguments
     arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
-    action: str | None = None
+    action: str | None = None  # the form of the actions, if requested
+    # the parts that the agent observes, if the command line or the agent's class names parts
     observation: tuple[str, ...] | None = None
 
 
@@ -78,12 +68,9 @@ class RunSettings(RunOptions):
     """The table ``[run]``: how the hunt runs.
 
     These options do not change trials, so a resumed hunt may have other values.
-
-    Args:
-        parallel: number of trials at a time.
     """
 
-    parallel: int = 1
+    parallel: int = 1  # number of trials at a time
 
     @property
     def duration_s(self) -> float:
@@ -94,35 +81,23 @@ class RunSettings(RunOptions):
 @clear_constructor
 @dataclass(frozen=True, kw_only=True)
 class HuntSettings(TrialOptions):
-    """The contents of ``hunt.toml``: all options that determine trials.
+    """The contents of ``hunt.toml``: all options that determine trials."""
 
-    Args:
-        scenario: name or path of the scenario, as the user gave it.
-        scenario_digest: digest of the scenario's files and settings.
-        trials: maximum number of trials; 0 if only the time is limited.
-        max_steps: maximum number of steps of a trial.
-        seed: seed of the hunt; a trial is determined by this seed and its number.
-        crash_on: the outcomes that count as a crash.
-        oracles: the oracles that detect crashes, each as in ``--oracle``.
-        agents: agent of each controlled vehicle with its arguments, by agent id.
-        scenario_arguments: the values that the hunt tries for the scenario's arguments.
-        events: limits of traffic events that the user requested, such as ``not_moving`` in s.
-        run: options that determine how the hunt runs.
-        schema: version of the file format.
-    """
-
-    scenario: str
-    scenario_digest: str
-    trials: int
-    max_steps: int
-    seed: int
-    crash_on: tuple[Outcome, ...] = CRASHES
-    oracles: tuple[str, ...] = DEFAULT_ORACLES
+    scenario: str  # name or path of the scenario, as the user gave it
+    scenario_digest: str  # digest of the scenario's files and settings
+    trials: int  # maximum number of trials; 0 if only the time is limited
+    max_steps: int  # maximum number of steps of a trial
+    seed: int  # seed of the hunt; a trial is determined by this seed and its number
+    crash_on: tuple[Outcome, ...] = CRASHES  # the outcomes that count as a crash
+    oracles: tuple[str, ...] = DEFAULT_ORACLES  # the oracles that detect crashes, each as in ``--oracle``
+    # agent of each controlled vehicle with its arguments, by agent id
     agents: dict[str, AgentSettings] = field(default_factory=dict)
+    # the values that the hunt tries for the scenario's arguments
     scenario_arguments: dict[str, ArgumentSpec] = field(default_factory=dict)
+    # limits of traffic events that the user requested, such as ``not_moving`` in s
     events: dict[str, float] = field(default_factory=dict)
-    run: RunSettings = field(default_factory=RunSettings)
-    schema: Literal[1] = 1
+    run: RunSettings = field(default_factory=RunSettings)  # options that determine how the hunt runs
+    schema: Literal[1] = 1  # version of the file format
 
     @property
     def probe_s(self) -> float:

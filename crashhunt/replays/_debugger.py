@@ -353,27 +353,16 @@ class _Done(TypedDict):
 
 
 class _Job(TypedDict):
-    """The description of a debugged replay that its process reads from a file.
+    """The description of a debugged replay that its process reads from a file."""
 
-    Args:
-        settings: settings of the worker.
-        spec: the trial, shortened to the steps that run.
-        stop_at: the step in which the debugger stops; 0 for none.
-        agent: the agent that the window follows.
-        other: the collision partner; empty if there was none.
-        panels: the first step whose panels are drawn, and the folder for the pictures.
-        window: wall time of a step in the window, in s; None if no window is shown.
-        pause_before: the step before which the window waits.
-    """
-
-    settings: JsonObject
-    spec: JsonObject
-    stop_at: int
-    agent: str
-    other: str
-    panels: tuple[int, str] | None
-    window: float | None
-    pause_before: int
+    settings: JsonObject  # settings of the worker
+    spec: JsonObject  # the trial, shortened to the steps that run
+    stop_at: int  # the step in which the debugger stops; 0 for none
+    agent: str  # the agent that the window follows
+    other: str  # the collision partner; empty if there was none
+    panels: tuple[int, str] | None  # the first step whose panels are drawn, and the folder for the pictures
+    window: float | None  # wall time of a step in the window, in s; None if no window is shown
+    pause_before: int  # the step before which the window waits
 
 
 class _Window(Observer):
