@@ -27,15 +27,10 @@ PRESENCE, X, Y, VX, VY, COS_H, SIN_H = range(7)
 
 @dataclass(frozen=True, slots=True)
 class Leader:
-    """The nearest vehicle ahead on a path.
+    """The nearest vehicle ahead on a path."""
 
-    Args:
-        gap: gap from bumper to bumper if both vehicles are cars, in m; an observation contains no lengths.
-        closing_speed: speed at which the gap shrinks, in m/s; negative if it grows.
-    """
-
-    gap: float
-    closing_speed: float
+    gap: float  # gap from bumper to bumper if both vehicles are cars, in m; an observation contains no lengths
+    closing_speed: float  # speed at which the gap shrinks, in m/s; negative if it grows
 
 
 def check_layout(space: Space[object] | None) -> None:

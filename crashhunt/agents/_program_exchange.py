@@ -74,9 +74,6 @@ class ProgramExchange:
         log: file descriptor for its standard error; None for that of this process.
         libraries: folder with copies of the libraries that the program loads; empty if there are none.
         is_forked: whether this process is forked while the program runs. A fork then starts the program again.
-
-    Attributes:
-        exchanges: each observation that was sent, and the action in its answer; empty if this process is not forked.
     """
 
     def __init__(
@@ -96,6 +93,7 @@ class ProgramExchange:
         self._is_idle = False  # whether the program has answered every message
         self._owner = 0  # the process that has started the program
         self._is_forked = is_forked
+        # each observation that was sent, and the action in its answer; empty if this process is not forked
         self.exchanges: list[tuple[bytes, Any]] = []
         self._exchanged_bytes = 0
 

@@ -39,19 +39,12 @@ _SAME_DIRECTION = 0.5  # least cosine of the angle between the headings
 
 @dataclass(slots=True, eq=False)
 class _Watched:
-    """A vehicle that the driver watches.
+    """A vehicle that the driver watches."""
 
-    Args:
-        ahead: where it is expected in the next observation, in m ahead.
-        right: where it is expected in the next observation, in m to the right.
-        model: the driver's reaction to this vehicle.
-        aside: its distance to the path in the last observation, in m.
-    """
-
-    ahead: float
-    right: float
-    model: ReferenceModel
-    aside: float
+    ahead: float  # where it is expected in the next observation, in m ahead
+    right: float  # where it is expected in the next observation, in m to the right
+    model: ReferenceModel  # the driver's reaction to this vehicle
+    aside: float  # its distance to the path in the last observation, in m
 
 
 class ReferenceDriver(SpeedAgent):

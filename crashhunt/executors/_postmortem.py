@@ -62,17 +62,11 @@ class LostTrialError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class EndedTrial:
-    """A trial that has ended.
+    """A trial that has ended."""
 
-    Args:
-        result: result of the trial.
-        notices: texts for the user.
-        braking: how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request
-            it.
-    """
-
-    result: TrialResult
-    notices: tuple[str, ...] = ()
+    result: TrialResult  # result of the trial
+    notices: tuple[str, ...] = ()  # texts for the user
+    # how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request it
     braking: Mapping[str, object] | None = None
 
 
@@ -84,16 +78,12 @@ class TrialAttempt:
     out. After such a signal, the trial is run again, alone. If it ends in the same way at the same step, the trial
     itself is the cause. If it ends at another step each time, the trial is not the cause. An end before the first step
     is no evidence, because the process that forks trials may have been killed.
-
-    Args:
-        spec: the trial to run.
-        ends: the signal and the step at which each process of the trial ended.
-        result: result of the trial, while further trials search for its last avoidable step.
     """
 
-    spec: TrialSpec
+    spec: TrialSpec  # the trial to run
+    # the signal and the step at which each process of the trial ended
     ends: list[tuple[int, int]] = field(default_factory=list)
-    result: TrialResult | None = None
+    result: TrialResult | None = None  # result of the trial, while further trials search for its last avoidable step
 
     @property
     def alone(self) -> bool:

@@ -81,15 +81,10 @@ def _rehearse(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """The result of the preparation that is made once, before the processes of trials are forked.
+    """The result of the preparation that is made once, before the processes of trials are forked."""
 
-    Args:
-        parts: the imported parts; None if each trial imports its agents itself.
-        makes_simulator: whether the zygote creates the simulator; if not, each trial creates its own simulator.
-    """
-
-    parts: Parts | None
-    makes_simulator: bool
+    parts: Parts | None  # the imported parts; None if each trial imports its agents itself
+    makes_simulator: bool  # whether the zygote creates the simulator; if not, each trial creates its own simulator
 
 
 _NOTHING_IMPORTED: Final = Imported(None, makes_simulator=False)

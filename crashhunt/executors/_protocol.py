@@ -72,19 +72,12 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NodeFigures:
-    """A machine on which trials run, with its figures for the status screen.
+    """A machine on which trials run, with its figures for the status screen."""
 
-    Args:
-        name: name of the machine.
-        parallel: number of trials that run on the machine at a time.
-        trials: number of trials that have ended on the machine in this run of the hunt.
-        rate_per_s: trials per second since the machine joined the hunt.
-    """
-
-    name: str
-    parallel: int
-    trials: int
-    rate_per_s: float
+    name: str  # name of the machine
+    parallel: int  # number of trials that run on the machine at a time
+    trials: int  # number of trials that have ended on the machine in this run of the hunt
+    rate_per_s: float  # trials per second since the machine joined the hunt
 
 
 class HasNodes(Protocol):

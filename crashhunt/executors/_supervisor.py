@@ -52,9 +52,6 @@ class Supervisor:
         zygote: connection to the zygote of this slot.
         conditions: the conditions under which trials can run, as they were before the first trial; None to skip the
             check of these conditions.
-
-    Attributes:
-        retires: whether the zygote may run no further trial.
     """
 
     def __init__(
@@ -65,7 +62,7 @@ class Supervisor:
         self._zygote = zygote
         self._received = bytearray()
         self._zygote_pid = 0  # once it is ready
-        self.retires = False
+        self.retires = False  # whether the zygote may run no further trial
         self._folder = TrialFolder(settings.scratch, self._check_host)
         self._trials = 0
 

@@ -76,13 +76,11 @@ class ImportWatch:
 
     Args:
         timeout_s: wall-clock limit of a trial, in s; imports may take `START_UP_S` longer.
-
-    Attributes:
-        importing: the error to report if the process never reports again, such as "the module 'planner' of agent ego
-            cannot be imported"; empty if all imports are complete.
     """
 
     def __init__(self, timeout_s: float) -> None:
+        # the error to report if the process never reports again, such as "the module 'planner' of agent ego cannot be
+        # imported"; empty if all imports are complete
         self.importing = "what trials need cannot be imported"
         self._limit_s = START_UP_S + timeout_s
         self._ends_at = time.monotonic() + self._limit_s

@@ -167,19 +167,12 @@ class WarmTraffics:
 
 @dataclass(slots=True, eq=False)
 class _Suspended:
-    """A suspended process and the pipes to it, as the zygote stores them.
+    """A suspended process and the pipes to it, as the zygote stores them."""
 
-    Args:
-        pid: process id of the suspended process.
-        requests: the pipe for requests to the process.
-        answers: the pipe for answers from the process.
-        used: number of the last trial that used the process.
-    """
-
-    pid: int
-    requests: int
-    answers: int
-    used: int
+    pid: int  # process id of the suspended process
+    requests: int  # the pipe for requests to the process
+    answers: int  # the pipe for answers from the process
+    used: int  # number of the last trial that used the process
 
     def ask(self, text: bytes, wait: Wait) -> _Answer | None:
         """Send a request to the process, and return its answer; None if the process has ended."""

@@ -22,17 +22,11 @@ _MAX_TRIAL_LOSSES = 2  # of a trial with its node; then it runs alone on one, in
 
 @dataclass(slots=True, eq=False)
 class Trial:
-    """A submitted trial.
+    """A submitted trial."""
 
-    Args:
-        ticket: position of the trial in the order of submission.
-        spec: specification of the trial as JSON.
-        losses: number of times that the node of the trial was lost.
-    """
-
-    ticket: int
-    spec: JsonObject
-    losses: int = 0
+    ticket: int  # position of the trial in the order of submission
+    spec: JsonObject  # specification of the trial as JSON
+    losses: int = 0  # number of times that the node of the trial was lost
 
     @property
     def number(self) -> int:
@@ -47,37 +41,21 @@ class Trial:
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """A machine that runs trials, or a part of a machine whose CPUs became free at different times.
+    """A machine that runs trials, or a part of a machine whose CPUs became free at different times."""
 
-    Args:
-        id: identifier of this part of a machine.
-        machine: Ray's identifier of the machine.
-        name: name of the machine for users.
-        slots: number of trials that run at a time.
-        actor: the actor that runs on the node.
-        stood: time at which the actor was started, on the clock `time.monotonic`.
-        doing: the last request that has no answer yet.
-        answer: Ray's reference to the answer of this request.
-        ready: whether the node runs trials.
-        given: trials to send with the next request, by ticket.
-        running: trials that run on the node, by ticket.
-        done: number of trials that have ended on the node.
-        since: time at which the node became ready, on the clock `time.monotonic`.
-    """
-
-    id: str
-    machine: str
-    name: str
-    slots: int
-    actor: Any
-    stood: float = 0.0
-    doing: str = ""
-    answer: Any = None
-    ready: bool = False
-    given: list[Submitted] = field(default_factory=list)
-    running: dict[int, Trial] = field(default_factory=dict)
-    done: int = 0
-    since: float = 0.0
+    id: str  # identifier of this part of a machine
+    machine: str  # Ray's identifier of the machine
+    name: str  # name of the machine for users
+    slots: int  # number of trials that run at a time
+    actor: Any  # the actor that runs on the node
+    stood: float = 0.0  # time at which the actor was started, on the clock `time.monotonic`
+    doing: str = ""  # the last request that has no answer yet
+    answer: Any = None  # Ray's reference to the answer of this request
+    ready: bool = False  # whether the node runs trials
+    given: list[Submitted] = field(default_factory=list)  # trials to send with the next request, by ticket
+    running: dict[int, Trial] = field(default_factory=dict)  # trials that run on the node, by ticket
+    done: int = 0  # number of trials that have ended on the node
+    since: float = 0.0  # time at which the node became ready, on the clock `time.monotonic`
 
     @property
     def has_room(self) -> bool:
