@@ -47,8 +47,7 @@ char *put_step(char *place, long tag, long long step, double time_s, size_t agen
 // A record of an array as BlackBox._raw packs it.
 PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 7) {
-        PyErr_SetString(PyExc_TypeError, "write_array takes a buffer, an array and five numbers");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "write_array takes a buffer, an array and five numbers");
     }
     const Py_ssize_t offset = PyLong_AsSsize_t(given[1]);
     const long tag = PyLong_AsLong(given[2]), agent = PyLong_AsLong(given[3]), phase = PyLong_AsLong(given[6]);
@@ -77,8 +76,7 @@ PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
     PyBuffer_Release(&array);
     PyBuffer_Release(&buffer);
     if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "an array is written beyond the end");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "an array is written beyond the end");
     }
     return PyLong_FromSize_t(static_cast<size_t>(offset) + 8 + length + padding);
 }
@@ -88,8 +86,7 @@ PyObject *write_array(PyObject *, PyObject *const *given, Py_ssize_t count) {
 PyObject *changes_of(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Py_buffer before, now;
     if (count != 2) {
-        PyErr_SetString(PyExc_TypeError, "changes_of takes two arrays");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "changes_of takes two arrays");
     }
     if (PyObject_GetBuffer(given[0], &before, PyBUF_SIMPLE) < 0) {
         return nullptr;
@@ -133,8 +130,7 @@ PyObject *changes_of(PyObject *, PyObject *const *given, Py_ssize_t count) {
 PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *columns = count == 8 ? columns_of(given[6]) : nullptr;
     if (!columns) {
-        PyErr_SetString(PyExc_TypeError, "write_step takes a buffer, six more and columns");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "write_step takes a buffer, six more and columns");
     }
     const Py_ssize_t offset = PyLong_AsSsize_t(given[1]);
     const long tag = PyLong_AsLong(given[2]);
@@ -157,8 +153,7 @@ PyObject *write_step(PyObject *, PyObject *const *given, Py_ssize_t count) {
     }
     if (offset < 64 || static_cast<size_t>(offset) + 8 + payload > static_cast<size_t>(buffer.len)) {
         PyBuffer_Release(&buffer);
-        PyErr_SetString(PyExc_ValueError, "a step is written beyond the end");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "a step is written beyond the end");
     }
     char *place = put_step(static_cast<char *>(buffer.buf) + offset, tag, step, time_s, agents, values);
     for (size_t agent = 0; agent < agents; agent++) {

@@ -189,8 +189,7 @@ struct Pair {
 // If only the best pair is asked for, pairs are left out for which another pair is certainly nearer in every measure.
 PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 7) {
-        PyErr_SetString(PyExc_TypeError, "may_be_near takes parts, five numbers and a truth");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "may_be_near takes parts, five numbers and a truth");
     }
     const double gap = PyFloat_AsDouble(given[1]), horizon = PyFloat_AsDouble(given[2]);
     double best_gap = PyFloat_AsDouble(given[3]), best_time = PyFloat_AsDouble(given[4]);

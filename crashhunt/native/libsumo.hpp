@@ -84,8 +84,7 @@ PyObject *bind(PyObject *, PyObject *path) {
     void *library = dlopen(PyBytes_AS_STRING(encoded), RTLD_LAZY | RTLD_NOLOAD);
     Py_DECREF(encoded);
     if (!library) {
-        PyErr_SetString(PyExc_OSError, "libsumo is not loaded");
-        return nullptr;
+        return PyErr_Format(PyExc_OSError, "libsumo is not loaded");
     }
     Sumo found = {};
     bool whole = find(library, "_ZN7libsumo7Vehicle11getPositionE" STRING "b", found.position) &&

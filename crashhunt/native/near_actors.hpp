@@ -81,8 +81,7 @@ PyObject *observed(const Scene &present, size_t row, size_t shown, double distan
 PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
     if (!columns) {
-        PyErr_SetString(PyExc_TypeError, "observe takes columns and five numbers");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "observe takes columns and five numbers");
     }
     const Py_ssize_t row = PyLong_AsSsize_t(given[1]), others = PyLong_AsSsize_t(given[2]);
     const double distance = PyFloat_AsDouble(given[3]), from_left = PyFloat_AsDouble(given[4]);
@@ -228,8 +227,7 @@ PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
     Columns *earlier = columns ? columns_of(given[1]) : nullptr;
     if (!earlier) {
-        PyErr_SetString(PyExc_TypeError, "within_reach takes columns twice, three numbers and earlier rows");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "within_reach takes columns twice, three numbers and earlier rows");
     }
     const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
     const double step_s = PyFloat_AsDouble(given[3]), hardest = PyFloat_AsDouble(given[4]);
@@ -275,8 +273,7 @@ double least_of(const Scene &earlier, const Scene &later) {
 PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Columns *was = count == 2 ? columns_of(given[0]) : nullptr, *is = was ? columns_of(given[1]) : nullptr;
     if (!is) {
-        PyErr_SetString(PyExc_TypeError, "least_change takes columns twice");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "least_change takes columns twice");
     }
     const Scene earlier(was), later(is);
     if (earlier.size != later.size) {

@@ -359,8 +359,7 @@ PyObject *write_part(PyObject *draft, PyObject *place, std::unique_ptr<Written> 
 // put(place, tuple of numbers)
 PyObject *draft_put(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
     if (count != 2 || !PyTuple_CheckExact(given[1])) {
-        PyErr_SetString(PyExc_TypeError, "put takes a place and a tuple");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "put takes a place and a tuple");
     }
     const Py_ssize_t place = PyLong_AsSsize_t(given[0]), size = PyTuple_GET_SIZE(given[1]);
     double *out = PyErr_Occurred() ? nullptr : part_at(draft, place, static_cast<size_t>(size));

@@ -276,8 +276,7 @@ struct NearLanes : Written {
 // lanes(place, ask, (number of lanes, points, before, stride, near_m, square_m)) -> whether it could be written
 PyObject *draft_lanes(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
     if (count != 3 || !PyTuple_CheckExact(given[2])) {
-        PyErr_SetString(PyExc_TypeError, "lanes takes a place, a function and a tuple");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "lanes takes a place, a function and a tuple");
     }
     auto part = std::make_unique<NearLanes>(given[1]);
     if (!PyArg_ParseTuple(given[2], "nnnndd", &part->wanted, &part->points, &part->before, &part->stride, &part->near_m,

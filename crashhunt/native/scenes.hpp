@@ -120,8 +120,7 @@ PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
         !numbers_of(reaches, roster->reaches) || roster->lengths.size() != roster->widths.size() ||
         roster->lengths.size() != roster->reaches.size()) {
         Py_DECREF(self);
-        PyErr_SetString(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
     }
     return reinterpret_cast<PyObject *>(self);
 }
@@ -161,8 +160,7 @@ Columns *columns_of(PyObject *object) {
 PyObject *columns(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Vehicles *vehicles = count == 4 ? vehicles_of(given[0]) : nullptr;
     if (!vehicles) {
-        PyErr_SetString(PyExc_TypeError, "columns takes vehicles and three lists");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "columns takes vehicles and three lists");
     }
     std::vector<double> values;
     const bool known = pairs(given[1], values) && numbers_of(given[2], values) && numbers_of(given[3], values);
@@ -223,8 +221,7 @@ PyObject *columns_speed(PyObject *object, PyObject *number) {
         return nullptr;
     }
     if (row < 0 || static_cast<size_t>(row) >= scene.size) {
-        PyErr_SetString(PyExc_IndexError, "no actor has this row");
-        return nullptr;
+        return PyErr_Format(PyExc_IndexError, "no actor has this row");
     }
     return PyFloat_FromDouble(scene.speeds[row]);
 }
@@ -371,8 +368,7 @@ PyObject *near_names() {
 PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t count) {
     Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
     if (!controlled) {
-        PyErr_SetString(PyExc_TypeError, "look takes vehicles and a number");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "look takes vehicles and a number");
     }
     const double within = PyFloat_AsDouble(given[1]);
     if (unbound() || PyErr_Occurred()) {
@@ -401,8 +397,7 @@ PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t cou
 PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
     Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
     if (!controlled) {
-        PyErr_SetString(PyExc_TypeError, "in_sight takes vehicles and a number");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "in_sight takes vehicles and a number");
     }
     const double within = PyFloat_AsDouble(given[1]);
     if (unbound() || PyErr_Occurred()) {

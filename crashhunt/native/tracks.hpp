@@ -99,8 +99,7 @@ struct Way {
 // on.
 PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
     if (count != 6) {
-        PyErr_SetString(PyExc_TypeError, "tracks takes parts and five numbers");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "tracks takes parts and five numbers");
     }
     const long long every = PyLong_AsLongLong(given[1]);
     const double within = PyFloat_AsDouble(given[2]), ahead = PyFloat_AsDouble(given[3]);

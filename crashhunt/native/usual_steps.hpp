@@ -19,8 +19,7 @@ PyObject *usual_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
         return nullptr;
     }
     if (others < 0 || every < 1) {
-        PyErr_SetString(PyExc_ValueError, "it looks around every so many steps, and sees so many others");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "it looks around every so many steps, and sees so many others");
     }
     std::string agent;
     UsualSteps *self = encode_name(name, agent) ? reinterpret_cast<UsualSteps *>(type->tp_alloc(type, 0)) : nullptr;
@@ -155,8 +154,7 @@ PyObject *usual_resume(PyObject *object, PyObject *arguments) {
     const Scene scene(reinterpret_cast<Columns *>(columns));
     const Roster &roster = *reinterpret_cast<Vehicles *>(vehicles)->roster;
     if (!steps.limits || !steps.stood || roster.ids.size() != scene.size) {
-        PyErr_SetString(PyExc_ValueError, "these are not the vehicles of the scene");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "these are not the vehicles of the scene");
     }
     if (!steps.set_sight(vehicles, ids, row, controlled, actors)) {
         return nullptr;
@@ -196,8 +194,7 @@ PyObject *usual_borrow(PyObject *object, PyObject *arguments) {
     steps.reserved = static_cast<size_t>(std::min(reserved, buffer.len));
     PyBuffer_Release(&buffer);
     if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "nothing can be written there");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "nothing can be written there");
     }
     Steps::Sight &seen = steps.earlier.empty() ? steps.sight : steps.entered;
     if (!seen.vehicles || !Steps::number(seen.actors, numbers, length)) {

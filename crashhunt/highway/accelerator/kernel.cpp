@@ -51,8 +51,7 @@ PyObject *traffic_act(Traffic *self, PyObject *) {
 
 PyObject *traffic_step(Traffic *self, PyObject *dt) {
     if (!PyFloat_CheckExact(dt)) {
-        PyErr_SetString(PyExc_TypeError, "the length of a sub-step must be a float");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "the length of a sub-step must be a float");
     }
     double length = PyFloat_AS_DOUBLE(dt);
     Moved moved = move_all(self, length, dt);
@@ -64,8 +63,7 @@ PyObject *traffic_step(Traffic *self, PyObject *dt) {
 
 PyObject *traffic_collide(Traffic *self, PyObject *dt) {
     if (!PyFloat_CheckExact(dt)) {
-        PyErr_SetString(PyExc_TypeError, "the length of a sub-step must be a float");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "the length of a sub-step must be a float");
     }
     if (!collide_all(self, PyFloat_AS_DOUBLE(dt), dt)) {
         return fail(self, false);
@@ -264,8 +262,7 @@ PyObject *traffic_fill_times(Traffic *self, PyObject *args) {
     PyBuffer_Release(&speeds);
     PyBuffer_Release(&relations);
     if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the grid has another size than its parts");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "the grid has another size than its parts");
     }
     Py_RETURN_NONE;
 }
@@ -510,8 +507,7 @@ PyObject *network_mark_cells(Network *self, PyObject *args) {
     const Py_ssize_t most = 1000000;
     if (!(grid.spacing > 0 && grid.reach / grid.spacing < 1e6) || grid.cells[0] < 0 || grid.cells[1] < 0 ||
         grid.cells[0] > most || grid.cells[1] > most) {
-        PyErr_SetString(PyExc_ValueError, "the grid is too large");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "the grid is too large");
     }
     PyObject *marks = PyByteArray_FromStringAndSize(nullptr, grid.cells[0] * grid.cells[1]);
     PyObject *unsure = PyList_New(0), *both = nullptr;
@@ -557,16 +553,14 @@ PyObject *bind(PyObject *, PyObject *args) {
         return nullptr;
     }
     if (PyList_GET_SIZE(ufuncs) != FUNCTIONS) {
-        PyErr_SetString(PyExc_ValueError, "seven functions are needed");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "seven functions are needed");
     }
     for (int wanted = 0; wanted < FUNCTIONS; wanted++) {
         const UFunc *ufunc = reinterpret_cast<const UFunc *>(PyList_GET_ITEM(ufuncs, wanted));
         int arguments = wanted == ARCTAN2 || wanted == POWER ? 2 : 1, which = 0;
         if (ufunc->nin != arguments || ufunc->nout != 1 || ufunc->nargs != arguments + 1 || !ufunc->name ||
             std::strcmp(ufunc->name, NAMES[wanted])) {
-            PyErr_Format(PyExc_OSError, "NumPy's function %s has an unknown layout", NAMES[wanted]);
-            return nullptr;
+            return PyErr_Format(PyExc_OSError, "NumPy's function %s has an unknown layout", NAMES[wanted]);
         }
         for (; which < ufunc->ntypes; which++) {
             const char *types = ufunc->types + which * ufunc->nargs;
@@ -579,8 +573,7 @@ PyObject *bind(PyObject *, PyObject *args) {
             }
         }
         if (which == ufunc->ntypes || !ufunc->functions[which]) {
-            PyErr_Format(PyExc_OSError, "NumPy's function %s is not for float64", NAMES[wanted]);
-            return nullptr;
+            return PyErr_Format(PyExc_OSError, "NumPy's function %s is not for float64", NAMES[wanted]);
         }
         functions[wanted] = {ufunc->functions[which], ufunc->data ? ufunc->data[which] : nullptr};
     }
@@ -627,8 +620,7 @@ PyObject *compute(PyObject *, PyObject *args) {
     if (!std::strcmp(name, "remainder")) {
         return PyFloat_FromDouble(remainder_of(a, b));
     }
-    PyErr_Format(PyExc_ValueError, "unknown function %s", name);
-    return nullptr;
+    return PyErr_Format(PyExc_ValueError, "unknown function %s", name);
 }
 
 // mirrored_poses(objects, half_lengths): the points half a length ahead of objects, their headings and their speeds, with the
@@ -640,8 +632,7 @@ PyObject *mirrored_poses(PyObject *, PyObject *args) {
     }
     const Py_ssize_t count = PyList_GET_SIZE(objects);
     if (PyList_GET_SIZE(halves) != count) {
-        PyErr_SetString(PyExc_ValueError, "one half of a length is needed for each object");
-        return nullptr;
+        return PyErr_Format(PyExc_ValueError, "one half of a length is needed for each object");
     }
     PyObject *points = PyList_New(count), *headings = PyList_New(count), *speeds = PyList_New(count), *all = nullptr;
     bool known = points && headings && speeds;
@@ -701,51 +692,12 @@ PyMethodDef methods[] = {
 PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_crashhunt_highway", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};
 
 bool intern_names() {
+#define NAME(name) {&s_##name, #name},
+#define CONSTANT(name, text) {&s_##name, #text},
     const struct {
         PyObject **place;
         const char *text;
-    } names[] = {
-        {&s_position, "position"},
-        {&s_heading, "heading"},
-        {&s_speed, "speed"},
-        {&s_lane, "lane"},
-        {&s_lane_index, "lane_index"},
-        {&s_target_lane_index, "target_lane_index"},
-        {&s_target_speed, "target_speed"},
-        {&s_timer, "timer"},
-        {&s_crashed, "crashed"},
-        {&s_impact, "impact"},
-        {&s_action, "action"},
-        {&s_steering, "steering"},
-        {&s_acceleration, "acceleration"},
-        {&s_route, "route"},
-        {&s_enable_lane_change, "enable_lane_change"},
-        {&s_check_collisions, "check_collisions"},
-        {&s_collidable, "collidable"},
-        {&s_diagonal, "diagonal"},
-        {&s_follow_road, "follow_road"},
-        {&s_handle_collisions, "handle_collisions"},
-        {&s_acceleration_parameters, "ACCELERATION_PARAMETERS"},
-        {&s_steering_parameters, "STEERING_PARAMETERS"},
-        {&s_collecting_data, "collecting_data"},
-        {&s_data, "data"},
-        {&s_solid, "solid"},
-        {&s_hit, "hit"},
-        {&s_road, "road"},
-        {&s_vehicles, "vehicles"},
-        {&s_objects, "objects"},
-        {&s_delta, "DELTA"},
-        {&s_prediction_type, "prediction_type"},
-        {&s_lateral_speed, "lateral_speed"},
-        {&s_yaw_rate, "yaw_rate"},
-        {&s_mass, "MASS"},
-        {&s_length_a, "LENGTH_A"},
-        {&s_length_b, "LENGTH_B"},
-        {&s_inertia_z, "INERTIA_Z"},
-        {&s_friction_front, "FRICTION_FRONT"},
-        {&s_friction_rear, "FRICTION_REAR"},
-        {&s_max_angular_speed, "MAX_ANGULAR_SPEED"},
-    };
+    } names[] = {NAMES_OF_ATTRIBUTES(NAME, CONSTANT)};
     for (const auto &name : names) {
         *name.place = PyUnicode_InternFromString(name.text);
         if (!*name.place) {

@@ -70,12 +70,18 @@ struct Actor {
     Number lateral_speed, yaw_rate; // of the dynamic bicycle model
 };
 
-PyObject *s_position, *s_heading, *s_speed, *s_lane, *s_lane_index, *s_target_lane_index, *s_target_speed, *s_timer,
-    *s_crashed, *s_impact, *s_action, *s_steering, *s_acceleration, *s_route, *s_enable_lane_change, *s_check_collisions,
-    *s_collidable, *s_diagonal, *s_follow_road, *s_handle_collisions, *s_acceleration_parameters,
-    *s_steering_parameters, *s_collecting_data, *s_data, *s_solid, *s_hit, *s_road, *s_vehicles,
-    *s_objects, *s_delta, *s_prediction_type, *s_lateral_speed, *s_yaw_rate, *s_mass,
-    *s_length_a, *s_length_b, *s_inertia_z, *s_friction_front, *s_friction_rear, *s_max_angular_speed;
+#define NAMES_OF_ATTRIBUTES(NAME, CONSTANT) \
+    NAME(position) NAME(heading) NAME(speed) NAME(lane) NAME(lane_index) NAME(target_lane_index) \
+    NAME(target_speed) NAME(timer) NAME(crashed) NAME(impact) NAME(action) NAME(steering) NAME(acceleration) \
+    NAME(route) NAME(enable_lane_change) NAME(check_collisions) NAME(collidable) NAME(diagonal) \
+    NAME(follow_road) NAME(handle_collisions) CONSTANT(acceleration_parameters, ACCELERATION_PARAMETERS) \
+    CONSTANT(steering_parameters, STEERING_PARAMETERS) NAME(collecting_data) NAME(data) NAME(solid) NAME(hit) \
+    NAME(road) NAME(vehicles) NAME(objects) CONSTANT(delta, DELTA) NAME(prediction_type) NAME(lateral_speed) \
+    NAME(yaw_rate) CONSTANT(mass, MASS) CONSTANT(length_a, LENGTH_A) CONSTANT(length_b, LENGTH_B) \
+    CONSTANT(inertia_z, INERTIA_Z) CONSTANT(friction_front, FRICTION_FRONT) \
+    CONSTANT(friction_rear, FRICTION_REAR) CONSTANT(max_angular_speed, MAX_ANGULAR_SPEED)
+#define DECLARE(name, ...) PyObject *s_##name;
+NAMES_OF_ATTRIBUTES(DECLARE, DECLARE)
 PyObject *numpy_float; // the type np.float64
 PyObject *numpy_int;   // the type np.int64
 PyObject *numpy_short; // the type np.float32

@@ -39,8 +39,7 @@ PyObject *snapshot_new(PyTypeObject *type, PyObject *args, PyObject *) {
                 PyTuple_GET_SIZE(row) == PyTuple_GET_SIZE(PyTuple_GET_ITEM(values, at));
     }
     if (!usual) {
-        PyErr_SetString(PyExc_TypeError, "each namespace needs as many names as values");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "each namespace needs as many names as values");
     }
     Snapshot *self = reinterpret_cast<Snapshot *>(type->tp_alloc(type, 0));
     if (self) {
@@ -55,8 +54,7 @@ PyObject *snapshot_new(PyTypeObject *type, PyObject *args, PyObject *) {
 PyObject *snapshot_first_changed(Snapshot *self, PyObject *sizes) {
     const Py_ssize_t count = PyTuple_GET_SIZE(self->spaces);
     if (!PyList_CheckExact(sizes) || PyList_GET_SIZE(sizes) != count) {
-        PyErr_SetString(PyExc_TypeError, "one size is needed for each namespace");
-        return nullptr;
+        return PyErr_Format(PyExc_TypeError, "one size is needed for each namespace");
     }
     for (Py_ssize_t at = 0; at < count; at++) {
         PyObject *space = PyTuple_GET_ITEM(self->spaces, at), *names = PyTuple_GET_ITEM(self->names, at);
