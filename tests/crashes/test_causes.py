@@ -151,11 +151,6 @@ def test_every_crash_has_the_cause_of_the_nearest_judged_one(points, data):
         assert mine == place or place not in places
 
 
-def test_far_groups_are_all_chosen():
-    points = [(0.0, 0.0)] * 30 + [(50.0, 0.0)] + [(0.0, 50.0)]
-    assert {30, 31} < {*chosen_of(division(points, 3))}
-
-
 def test_division_is_complete_once_all_chosen_crashes_have_an_answer():
     found = division([(0.0,), (5.0,), (9.0,)], 2)
     first, second = chosen_of(found)

@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 from test_fault import LANES, Map, rotated
 
 from crashhunt.crashes import find_bundle
-from crashhunt.crashes._contact_record import ContactRecord, _distance, contact_record, record_in
+from crashhunt.crashes._contact_record import ContactRecord, contact_record, record_in
 from crashhunt.crashes._fault import fault_in
 from crashhunt.crashes._lanes import LaneMap
 from crashhunt.trial import Collision
@@ -317,23 +317,6 @@ def with_lanes(case, lanes_at):
     return replace(case, scenes=scenes)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.7, -2.3])
-def test_distances_along_and_across_the_other_actor(angle):
-    case = rotated(record(drives(15.0), drives(8.0, x=5.0, y=1.5), step_s=0.5), angle)
-    assert case.times == pytest.approx(np.append(np.arange(4.0, 0.55, -0.1), 0.5))
-    assert (case.ahead_m("other"), case.ahead_m("ego")) == pytest.approx((8.5, -8.5))  # 0.5 s before
-    assert (case.ahead_m("other", 0), case.gap_m("other", 0), case.gap_m("other")) == pytest.approx((33.0, 28.0, 3.5))
-    assert (case.aside_m("other"), case.aside_m("ego", 0)) == pytest.approx((1.5, -1.5))
-    assert (case.turn, case.turned(4.0)) == pytest.approx((0.0, 0.0), abs=1e-9)
-
-
-def test_turn_of_the_last_seconds_is_the_greatest_angle_between_both():
-    case = record(drives(5.0), lambda t: (5.0 + 3 * t, 0.0, 0.5 if t < -2 else 0.1, 3.0), step_s=0.5)
-    assert (case.turned(1.0), case.turned(4.0)) == pytest.approx((0.1, 0.5))
-    around = record(lambda t: (5 * t, 0.0, 3.1, 5.0), lambda t: (5.0 + 3 * t, 0.0, -3.1, 3.0), step_s=0.5)
-    assert around.turned(4.0) == pytest.approx(math.tau - 6.2)
-
-
 def test_speeds_and_decelerations_before_a_contact():
     case = record(brakes(15.0, 2.0), drives(8.0, x=5.0), step_s=0.5)
     assert [case.speed_mps("ego", before_s) for before_s in (3.0, 1.0, 99.0)] == pytest.approx([21.0, 17.0, 23.0])
@@ -413,14 +396,6 @@ def test_lane_changes_count_from_the_given_time_on():
     assert case.changed_s("ego") == pytest.approx(2.0)
     assert [case.drifted(actor) for actor in ("ego", "other")] == [True, False]
     assert [case.was_off_path("ego", back) for back in (0, 20, -1)] == [True, True, False]
-
-
-@pytest.mark.parametrize(
-    ("point", "distance"), [((5.0, 3.0), 3.0), ((12.0, 0.0), 2.0), ((-3.0, -4.0), 5.0), ((13.0, 14.0), 5.0)]
-)
-def test_distance_from_a_path_is_that_of_its_nearest_point(point, distance):
-    path = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 0.0), (10.0, 10.0)])
-    assert _distance(path, np.array(point)) == pytest.approx(distance)
 
 
 def test_record_of_scenes_has_their_first_and_last_time():

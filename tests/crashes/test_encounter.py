@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.crashes import Encounter, last_escape
-from crashhunt.crashes._encounter import Position, _Path
+from crashhunt.crashes._encounter import Position
 from crashhunt.recording import Prologue, StepRecord
 from crashhunt.world import Actor, Roster, Scene
 
@@ -213,31 +213,6 @@ def test_a_bent_one_is_measured_by_its_parts():
     third = {**step, "tram": (99.0, 99.0, 0.0, 0.0)}
     (unbent,) = Encounter(recording(third, sizes=sizes, spines={2: spine}), "ego", "other").moments
     assert unbent.gap_m == pytest.approx(28.75)
-
-
-def test_a_driven_path_is_found_by_its_length_and_continues_straight():
-    """Three sides of a square, at another speed each, and a turn across the heading of 180 degrees."""
-    poses = [(0, 0, 0), (4, 0, 0), (4, 0, 1.5), (4, 3, 3.0), (2, 3, -3.0)]
-    path = _Path(poses)
-    assert path.distances == [0, 4, 4, 7, 9]
-    for distance, (x, y, heading) in ((0, poses[0]), (1, (1, 0, 0)), (4, poses[1]), (7, poses[3])):
-        assert path.at(distance) == pytest.approx((x, y, heading))
-    assert path.at(5.5) == pytest.approx((4, 1.5, 2.25))
-    assert path.at(8)[:2] == pytest.approx((3, 3))
-    assert math.cos(path.at(8)[2]) == pytest.approx(-1)
-    assert path.at(11) == pytest.approx((2 + 2 * math.cos(3), 3 - 2 * math.sin(3), -3))
-    assert path.between(0, 0.25) == pytest.approx((1, 0, 0))
-
-
-def test_the_moments_before_a_rear_end_collision():
-    moments = Encounter(follow(speed=20, gap=38.5, leader=10), "ego", "other").moments
-    first, *_, last, touch = moments
-    assert (first.gap_m, first.closing_speed, first.time_to_collision_s) == pytest.approx((38.5, 10, 3.85))
-    assert first.required_deceleration == pytest.approx(100 / 77)
-    assert touch.gap_m == pytest.approx(0, abs=1e-9)
-    assert 0 < last.time_to_collision_s < 0.2
-    assert last.required_deceleration == pytest.approx(10 / (2 * last.time_to_collision_s))
-    assert [moment.step for moment in moments] == list(range(len(moments)))
 
 
 @pytest.mark.parametrize(("speed_at_the_end", "found"), [(10.0, 0), (0.0, None)])

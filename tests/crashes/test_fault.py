@@ -200,22 +200,6 @@ def test_who_changes_lanes_into_a_gap_that_is_too_short():
     assert verdict(drive(straight(25), cuts_in, lanes=Map([], (0.0, 0.0)))) == "nobody can tell"
 
 
-def test_who_moves_sideways_into_who_is_next_to():
-    def moves(t):
-        return 0.0 - 20 * t, 1.9 + min(2.1, 2 * t), -0.1, 20.0
-
-    assert verdict(drive(moves, straight(20, 1))) == "ego"
-    assert verdict(drive(straight(20, 1), moves)) == "the other"
-
-    def left(t):
-        return 1.0 - 20 * t, -1.0 - min(3.0, 2 * t), 0.1, 20.0
-
-    def right(t):
-        return 0.0 - 20 * t, 1.0 + min(3.0, 2 * t), -0.1, 20.0
-
-    assert verdict(drive(right, left)) == "both"
-
-
 def turning_left(after_s, speed=5.0, at=5.0):
     """Drives along the x axis, and turns off to the left so many s before the contact."""
 
@@ -409,17 +393,3 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
 def test_the_safe_gap_is_that_of_rss():
     assert safe_gap_m(20, 20) == pytest.approx(20 + 1.75 + 23.5**2 / 8 - 20**2 / 16)
     assert safe_gap_m(0, 30) == 0
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_distances_of_a_case_are_the_same_in_every_direction(angle):
-    case = drive(straight(20, 1.0, 0.5), turning_left(1.2, at=11.0))
-    again = rotated(case, angle)
-    for actor in ("ego", "other"):
-        for back in (-1, -9, 0):
-            for name in ("ahead_m", "gap_m", "aside_m"):
-                assert getattr(again, name)(actor, back) == pytest.approx(getattr(case, name)(actor, back)), name
-        assert again.in_its_way_s(actor) == pytest.approx(case.in_its_way_s(actor))
-        assert again.meets_sideways(actor) == case.meets_sideways(actor)
-    assert again.turn == pytest.approx(case.turn)
-    assert case.ahead_m("other", 0) == pytest.approx(70.0)  # 4 s before: at -9 m and at -79 m

@@ -19,7 +19,7 @@ from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings
 from crashhunt.executors.ray import RayExecutor, _cluster, _executor, _node_worker
 from crashhunt.executors.ray._cluster import Cluster, ClusterNode, Meant, NodeLostError, TokenError, UnreachableError
-from crashhunt.executors.ray._code_archive import NodeFolder, Store, _is_same_snapshot
+from crashhunt.executors.ray._code_archive import NodeFolder, _is_same_snapshot
 from crashhunt.executors.ray._node_actor import Site
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.scenario import AgentSetup, Scenario
@@ -597,18 +597,7 @@ def test_copy_of_the_current_folder_is_known_by_its_name_and_files(tmp_path, mon
     assert not _is_same_snapshot(place)
 
 
-def test_archives_that_were_used_last_are_kept(tmp_path):
-    store = Store(tmp_path / "store", kept_bytes=25)
-    for number, digest in enumerate(("a", "b", "c")):
-        store.keep(digest, b"x" * 10)
-        os.utime(tmp_path / f"store/{digest}.zip", (number, number))
-    assert store.find("a") is None
-    assert store.find("b") == b"x" * 10  # which uses it
-    store.keep("d", b"x" * 40)
-    assert [store.find(digest) is not None for digest in "bcd"] == [False, False, True]
-    store.drop("d")
-    store.drop("d")
-    assert store.find("d") is None
+def test_damaged_archive_leaves_no_code():
     place = NodeFolder()
     assert place.scratch.is_dir()
     assert not place.unpack(b"damaged", "digest")
