@@ -76,7 +76,7 @@ class CompiledNetwork(Protocol):
         """Return a byte for each cell that contains a point of a lane, and the lanes with points near a cell border."""
 
 
-class MembersSnapshot(Protocol):
+class Snapshot(Protocol):
     """The members that some namespaces had at one time, for a later comparison."""
 
     def first_changed(self, sizes: list[int], /) -> int:
@@ -98,7 +98,7 @@ class _Module(Protocol):
     INTERFACE: int
     Network: Callable[..., CompiledNetwork]
     Traffic: Callable[..., Traffic]
-    MembersSnapshot: Callable[..., MembersSnapshot]
+    Snapshot: Callable[..., Snapshot]
     Contents: Callable[[list[object]], Contents]
 
     def bind(self, *given: object) -> None: ...

@@ -20,7 +20,7 @@ from highway_env.envs.common import abstract, action, finite_mdp, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
-from crashhunt.highway.accelerator._kernel import MembersSnapshot, kernel, why_not
+from crashhunt.highway.accelerator._kernel import Snapshot, kernel, why_not
 from crashhunt.highway.accelerator._known_versions import ACCELERATED, reason_against_version
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Watch:
         skipped = frozenset(but)
         self._places: list[_Place] = [_Place(name, owner, skipped) for name, owner in places]
         self._reported = ""
-        self._snapshot: MembersSnapshot | None = None
+        self._snapshot: Snapshot | None = None
 
     @classmethod
     def of_roads(cls, but: Iterable[str]) -> Watch:
@@ -149,13 +149,13 @@ def _special(name: str) -> bool:
     return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
 
 
-def snapshot_of(spaces: Iterable[tuple[Space, Mapping[str, object]]]) -> MembersSnapshot:
+def snapshot_of(spaces: Iterable[tuple[Space, Mapping[str, object]]]) -> Snapshot:
     """Return a snapshot of the members of namespaces in the kernel, with which changes are found in microseconds."""
     module = kernel()
     assert module is not None
     owners, members = zip(*spaces, strict=True)
     names = tuple(tuple(part) for part in members)
-    return module.MembersSnapshot(tuple(owners), names, tuple(tuple(part.values()) for part in members))
+    return module.Snapshot(tuple(owners), names, tuple(tuple(part.values()) for part in members))
 
 
 def _classes(module: ModuleType) -> list[tuple[str, type]]:
