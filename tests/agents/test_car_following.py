@@ -126,12 +126,6 @@ def test_a_delay_is_counted_in_steps_of_the_simulation(delay_s, step_s, steps):
     assert [speed < 20.0 for speed in speeds] == [False] * steps + [True]
 
 
-def test_it_never_goes_backwards_and_never_accelerates_by_more_than_2():
-    agent = CarFollowing(delay_s=0.0, step_length_s=0.5, desired_speed=100.0)
-    assert agent.act(seen(0.2, {"x": 6, "vx": 0})) == (0.0, 0)
-    assert agent.act(seen(10.0, {"x": 400, "vx": 90}))[0] <= 11.0
-
-
 def test_it_follows_the_bend_that_it_drives_through():
     """The vehicle ahead is beside the straight line, but on the bend."""
     arc, radius = 0.25, 100.0

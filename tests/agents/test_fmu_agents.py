@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import zipfile
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 import pytest
 from conftest import one_in
-from gymnasium import spaces
 from programs import COMPILER, DRIVER
+from simulated import Simulated, answers_in_python, observations
 
 pytest.importorskip("fmpy", reason="FMPy is not installed", exc_type=ImportError)
 
@@ -26,17 +25,6 @@ from crashhunt.trial import Range, signature_of
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
 
 
-class Simulated:
-    """What an FMU is told of a simulator."""
-
-    step_length_s = 0.1
-    observation_names: ClassVar = COLUMNS
-    observation_spaces: ClassVar = {"ego": spaces.Box(-1e6, 1e6, (8, 7), np.float32)}
-
-    def __init__(self):
-        self.actions = {"ego": SpeedAndLaneChange()}
-
-
 def agent_of(fmu, *, limit_s=None, **arguments):
     factory = FmuFactory(f"fmu:{fmu}")
     agent = factory.agent("ego", Simulated(), arguments, folder=fmu.parent, files={}, limit_s=limit_s)
@@ -44,20 +32,13 @@ def agent_of(fmu, *, limit_s=None, **arguments):
     return agent
 
 
-def observations(count=20):
-    rng = np.random.default_rng(1)
-    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
-
-
 @pytest.mark.parametrize("version", [2, 3])
 def test_an_fmu_acts_like_the_agent_in_python_in_each_of_its_instances(tmp_path, version):
-    names: dict = {}
-    exec(DRIVER, names)
-    driver, agent = names["Driver"](speed=9.125), agent_of(build_fmu(tmp_path, version), speed=9.125)
+    agent = agent_of(build_fmu(tmp_path, version), speed=9.125)
     for seed in (1, 2):
         agent.reset(seed)
         answers = [agent.act(seen) for seen in observations()]
-        assert answers == [driver.act(seen) for seen in observations()]
+        assert answers == answers_in_python(speed=9.125)
         assert [type(part) for part in answers[0]] == [float, int]
     assert {speed for speed, _ in answers} == {0.0, 9.125}
     agent.close()

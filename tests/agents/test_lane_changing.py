@@ -31,17 +31,6 @@ def test_behind_a_slower_vehicle_it_changes_to_the_left_when_its_patience_is_ove
     assert changes(changer(patience_s=2.5), shown, steps=5) == [0, 0, 0, 0, 1]
 
 
-def test_it_waits_only_behind_a_vehicle_that_is_near_and_below_its_desired_speed():
-    agent = changer()
-    one, free = seen(15.0, SLOW, lane_y=LANE), seen(15.0, lane_y=LANE)
-    assert changes(agent, one, free, one, free, one, steps=5) == [0] * 5  # the wait begins again
-    assert changes(changer(), seen(15.0, {"x": 5 + 38, "vx": 0}, lane_y=LANE)) == [0] * 10  # 2.5 s away
-    assert any(changes(changer(), seen(15.0, {"x": 5 + 37, "vx": 0}, lane_y=LANE)))
-    assert changes(changer(), seen(20.0, SLOW, lane_y=LANE)) == [0] * 10  # 0.9 of 22 m/s
-    assert any(changes(changer(desired_speed=25.0), seen(20.0, SLOW, lane_y=LANE)))
-    assert any(changes(changer(), seen(1.0, {"x": 5 + 12, "vx": 0}, lane_y=LANE)))  # at least as if at 5 m/s
-
-
 @pytest.mark.parametrize("side", [1, -1])
 def test_it_changes_only_into_a_gap_in_which_no_vehicle_has_to_brake_hard(side):
     lane_y = LANE if side == 1 else 0.0
@@ -70,19 +59,6 @@ def test_it_changes_only_into_a_gap_in_which_no_vehicle_has_to_brake_hard(side):
     assert not goes(1.0, 0.0, blind_spot_m=7.0)
 
 
-def test_in_the_leftmost_lane_it_stays_where_it_has_seen_no_lane_to_its_right():
-    alone = seen(15.0, SLOW)
-    assert changes(changer(), alone) == [0] * 10
-    far = {"x": 25.0, "y": LANE}
-    oncoming, two_lanes_off = {"x": 10.0, "y": LANE, "heading": np.pi}, {"x": 10.0, "y": 2 * LANE}
-    for other in (far, oncoming, two_lanes_off):
-        assert changes(changer(), seen(15.0, SLOW, other), alone) == [0] * 10
-    beside = seen(15.0, SLOW, {"x": 15.0, "y": LANE})
-    assert -1 in changes(changer(), beside, alone)
-    behind = seen(15.0, SLOW, {"x": -15.0, "y": LANE})
-    assert -1 in changes(changer(), behind, alone)
-
-
 def test_a_lane_that_it_has_left_is_still_known_but_not_on_a_road_of_another_number_of_lanes():
     right, left = seen(15.0, SLOW, lane_y=LANE), seen(15.0, SLOW, lane_y=0.0)
     assert changes(changer(), right, right, left, steps=4) == [0, 1, 0, -1]
@@ -93,19 +69,6 @@ def test_a_lane_that_it_has_left_is_still_known_but_not_on_a_road_of_another_num
     agent.act(seen(15.0, {"x": 15.0, "y": LANE}))
     agent.reset(0)
     assert changes(agent, left) == [0] * 10
-
-
-def test_its_speed_follows_the_model_between_braking_with_8_and_accelerating_with_2_5():
-    agent = LaneChanger(desired_speed=22.0, step_length_s=0.1)
-    for shown, leader in (
-        (seen(15.0, {"x": 45, "vx": -2}), Leader(40.0, 2.0)),
-        (seen(15.0), None),
-        (seen(15.0, {"x": 7, "vx": -10}), Leader(2.0, 10.0)),
-    ):
-        wanted = idm_acceleration(15.0, leader, desired_speed=22.0, headway_s=1.2)
-        assert agent.act(shown)[0] == pytest.approx(15.0 + 0.1 * max(-8.0, wanted), abs=1e-4)
-    assert agent.act(seen(0.3, {"x": 6, "vx": 0}))[0] == 0.0
-    assert LaneChanger(desired_speed=22.0).act(seen(0.0))[0] <= 0.25
 
 
 def driver(**more):

@@ -12,13 +12,13 @@ import sqlite3
 import subprocess
 from contextlib import closing
 from importlib.util import find_spec
-from typing import ClassVar
 
 import numpy as np
 import pytest
 from compiled_libraries import IN_C, compile_library
 from gymnasium import spaces
 from programs import COMPILER, DRIVER
+from simulated import SPACE, Simulated, answers_in_python, observations
 
 from crashhunt.agents import FmuFactory, LibraryFactory, ProgramFactory
 from crashhunt.base.agent_locators import files_of
@@ -27,9 +27,6 @@ from crashhunt.simulators import MetaAction, SpaceAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
-
-COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
-SPACE = spaces.Box(-np.inf, np.inf, (8, 7), np.float32)
 
 # Returns what it has received as its action.
 ECHO = r"""
@@ -62,30 +59,12 @@ CRASHHUNT_EXPORT void crashhunt_destroy(void *agent) { (void)agent; }
 """
 
 
-class Simulated:
-    """What a library is told of a simulator."""
-
-    step_length_s = 0.25
-    observation_names: ClassVar = COLUMNS
-
-    def __init__(self, form, space):
-        self.actions = {"ego": form}
-        self.observation_spaces = {"ego": space}
-        if space is not SPACE:
-            self.observation_names = ()
-
-
 def agent_of(library, *, form=None, space=SPACE, seed=2**64 - 1, limit_s=None, **arguments):
-    simulator = Simulated(form or SpeedAndLaneChange(), space)
+    simulator = Simulated(form, space, 0.25)
     factory = LibraryFactory(f"lib:{library}")
     agent = factory.agent("ego", simulator, arguments, folder=library.parent, files={}, limit_s=limit_s)
     agent.reset(seed)
     return agent
-
-
-def observations(count=20):
-    rng = np.random.default_rng(1)
-    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
 
 
 @pytest.fixture(scope="module")
@@ -99,11 +78,9 @@ def echo(tmp_path_factory):
 
 
 def test_a_library_acts_like_the_agent_in_python(planner):
-    names: dict = {}
-    exec(DRIVER, names)
-    driver, agent = names["Driver"](speed=9.125), agent_of(planner, speed=9.125)
+    agent = agent_of(planner, speed=9.125)
     answers = [agent.act(seen) for seen in observations()]
-    assert answers == [driver.act(seen) for seen in observations()]
+    assert answers == answers_in_python(speed=9.125)
     assert {speed for speed, _ in answers} == {0.0, 9.125}
     assert [type(part) for part in answers[0]] == [float, int]
     agent.close()
@@ -162,7 +139,7 @@ def test_nested_observations_step_time_and_arguments_arrive_in_order(echo):
 
 def test_the_parts_that_an_agent_observes_have_their_columns(tmp_path):
     source = ECHO.replace('(double)crashhunt_part(kept, "camera/image")', 'crashhunt_column(&kept->parts[1], "speed")')
-    simulator = Simulated(SpaceAction(spaces.Box(-np.inf, np.inf, (5,), np.float64)), SPACE)
+    simulator = Simulated(SpaceAction(spaces.Box(-np.inf, np.inf, (5,), np.float64)))
     space = spaces.Dict({"actors": spaces.Box(-9, 9, (2, 1)), "ego": spaces.Box(-9, 9, (2,))})
     columns = {"actors": {"x": 0}, "ego": {"x": 0, "speed": 1}}
     simulator.observation_layouts = {"ego": type("Layout", (), {"space": space, "columns": columns})}
@@ -253,7 +230,7 @@ def test_a_needed_library_comes_from_the_snapshot_or_is_refused(tmp_path):
     named = compile_library(built, "libnamed.so", words=(*search, "-l:libneeded.so.1"))
     nameless = compile_library(built, "libfirst.so", words=(*search, "-l:libnameless.so"))
     assert files_of(f"lib:{named}") == {f"lib:{built}/libneeded.so.1": built / "libneeded.so.1", str(named): named}
-    simulator = Simulated(SpeedAndLaneChange(), SPACE)
+    simulator = Simulated()
     files = {f"lib:{built}/libneeded.so.1": str(tmp_path / "saved" / "libneeded.so.1"), str(named): str(named)}
     agent = LibraryFactory(f"lib:{named}").agent("ego", simulator, {}, folder=tmp_path, files=files)
     agent.reset(1)

@@ -10,14 +10,14 @@ import time
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
 from conftest import mostly_nightly
 from gymnasium import spaces
 from json_schemas import validator
-from programs import COMPILER, DRIVER, compile_program, write_binary_program, write_program
+from programs import COMPILER, compile_program, write_binary_program, write_program
+from simulated import Simulated, answers_in_python, observations
 
 import crashhunt
 from crashhunt.agents import ProgramFactory
@@ -31,25 +31,6 @@ from crashhunt.scenario import ObservationSetup
 from crashhunt.simulators import AccelerationAndLaneChange, Kinematics, MetaAction, SpeedAndLaneChange
 from crashhunt.trial import Range, signature_of
 from crashhunt.world import MapLane, RoadMap, StopLine, VehicleData
-
-COLUMNS = ("presence", "x", "y", "vx", "vy", "cos_h", "sin_h")
-SPACE = spaces.Box(-1e6, 1e6, (8, 7), np.float32)
-
-
-def observations(count=20):
-    rng = np.random.default_rng(1)
-    return [rng.uniform(-30, 30, (8, 7)).astype(np.float32) for _ in range(count)]
-
-
-class Simulated:
-    """What a program is told of a simulator."""
-
-    observation_names = COLUMNS
-    observation_spaces: ClassVar = {"ego": SPACE}
-    step_length_s = 0.1
-
-    def __init__(self, form):
-        self.actions = {"ego": form}
 
 
 class WithRoads(Simulated):
@@ -79,9 +60,8 @@ class WithRoads(Simulated):
 
 
 def agent_of(locator, folder, *, form=None, limit_s=None, is_forked=False, **arguments):
-    simulator = Simulated(form or SpeedAndLaneChange())
     return ProgramFactory(locator).agent(
-        "ego", simulator, arguments, folder=folder, files={}, limit_s=limit_s, is_forked=is_forked
+        "ego", Simulated(form), arguments, folder=folder, files={}, limit_s=limit_s, is_forked=is_forked
     )
 
 
@@ -178,16 +158,14 @@ def planner(tmp_path):
 
 
 def test_programs_in_python_and_c_and_one_with_binary_messages_act_like_the_agent_in_python(tmp_path, planner):
-    names: dict = {}
-    exec(DRIVER, names)
-    expected = [names["Driver"](speed=9.125).act(seen) for seen in observations()]
+    wanted = answers_in_python(speed=9.125)
     programs = [planner, write_binary_program(tmp_path), *([compile_program(tmp_path, "compiled")] if COMPILER else [])]
     for program in programs:
         agent = agent_of(f"exec:{program}", tmp_path / "scratch", speed=9.125)
         agent.reset(7)
-        assert [tuple(agent.act(seen)) for seen in observations()] == expected
+        assert [tuple(agent.act(seen)) for seen in observations()] == wanted
         agent.close()
-    assert {speed for speed, _ in expected} == {0.0, 9.125}
+    assert {speed for speed, _ in wanted} == {0.0, 9.125}
 
 
 def test_the_command_is_split_as_a_shell_would_and_runs_in_the_scratch_folder_without_a_shell(tmp_path):

@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from programs import DRIVER, write_binary_program, write_program
-from test_programs import agent_of, is_running, observations
+from programs import write_binary_program, write_program
+from simulated import answers_in_python, observations
+from test_programs import agent_of, is_running
 
 from crashhunt.agents import ProgramFactory, offer_reused
 from crashhunt.base import forks
@@ -41,19 +42,12 @@ def trial(program, locator, folder, *, steps=20, **arguments):
         agent.close()
 
 
-def expected(**arguments):
-    names: dict = {}
-    exec(DRIVER, names)
-    driver = names["Driver"](**arguments)
-    return [driver.act(seen) for seen in observations()]
-
-
 def test_a_program_drives_in_one_trial_after_another_with_the_arguments_of_each(tmp_path, reused):
     locator = f"exec:{write_program(tmp_path)}"
     program = reused(locator)
     pids = []
     for speed in (9.125, 17.0):
-        assert trial(program, locator, tmp_path, speed=speed) == expected(speed=speed)
+        assert trial(program, locator, tmp_path, speed=speed) == answers_in_python(speed=speed)
         pids.append(program.pid)
         program.move_log(tmp_path / f"log-{speed}")
     assert pids[0] == pids[1]
@@ -73,7 +67,7 @@ def test_a_program_with_binary_messages_receives_hello_in_them(tmp_path, reused)
     program = reused(locator)
     first = trial(program, locator, tmp_path, speed=9.125)
     pid = program.pid
-    assert first == trial(program, locator, tmp_path, speed=9.125) == expected(speed=9.125)
+    assert first == trial(program, locator, tmp_path, speed=9.125) == answers_in_python(speed=9.125)
     assert program.pid == pid
 
 
