@@ -33,7 +33,7 @@ from crashhunt.highway import (
 )
 from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
-from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter
+from crashhunt.highway._lanes_and_contacts import HighwayEvents, VehicleFilter
 from crashhunt.highway._surroundings import surroundings_of
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.trial import ALL_AGENTS, Disturbance
@@ -296,29 +296,6 @@ def on(road, start, end, s, kind=IDMVehicle):
     return made
 
 
-def test_lanes_ahead_end_at_a_fork_without_a_route():
-    road = crossing()
-    vehicle = on(road, "w", "c", 50.0)
-    ahead = lambda index=None: [lane[:2] for lane in _disturbances.lanes_ahead(road.network, vehicle, index)]  # noqa: E731
-    assert ahead() == [("w", "c")]
-    vehicle.route = [("w", "c", 0), ("c", "n", 0)]
-    assert ahead() == [("w", "c"), ("c", "n")]
-    vehicle.route = [("w", "c", 0), ("c", "nowhere", 0)]
-    assert ahead() == [("w", "c")]
-    assert ahead(("c", "e", 0)) == [("c", "e")]
-    plain = on(road, "w", "c", 50.0, kind=Vehicle)
-    assert [lane[:2] for lane in _disturbances.lanes_ahead(road.network, plain)] == [("w", "c")]
-    network = RoadNetwork()
-    for number in range(3):
-        network.add_lane("a", "b", StraightLane([0, 4 * number], [50, 4 * number]))
-    for number in range(2):
-        network.add_lane("b", "a", StraightLane([50, 4 * number], [0, 4 * number]))
-    road = Road(network, np_random=np.random.default_rng(1))
-    round_trip = IDMVehicle(road, [10.0, 8.0], 0.0, 10.0)
-    round_trip.lane_index = ("a", "b", 2)
-    assert list(_disturbances.lanes_ahead(network, round_trip)) == [("a", "b", 2), ("b", "a", 1)]
-
-
 @pytest.mark.parametrize(
     ("one", "two", "route", "crossed"),
     [
@@ -335,22 +312,6 @@ def test_paths_cross_within_their_reach(one, two, route, crossed):
     agent.route = [("w", "c", 0), ("c", route, 0)]
     assert _disturbances.crosses(road.network, agent, other) is crossed
     assert _disturbances.crosses(road.network, other, agent) is crossed
-
-
-def test_path_of_a_vehicle_has_a_point_every_2_m_for_80_m():
-    road = straight()
-    vehicle = put(road, 101.0, 1)
-    roads, points = _disturbances._way(road.network, vehicle)
-    assert roads == {("0", "1")}
-    assert points[:, 0].tolist() == [101.0, *range(101, 181, 2)]
-    assert set(points[:, 1]) == {4.0}
-    road = crossing()
-    turning = on(road, "w", "c", 97.0)
-    turning.route = [("w", "c", 0), ("c", "n", 0)]
-    roads, points = _disturbances._way(road.network, turning)
-    assert roads == {("w", "c"), ("c", "n")}
-    assert points[:5].tolist() == [[-3.0, 0.0], [-3.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]
-    assert points[-1].tolist() == [0.0, 48.0]  # the end of the road
 
 
 def test_crossing_vehicle_is_the_nearest_on_a_road_with_rules():
@@ -461,28 +422,6 @@ def test_excluded_objects_are_removed_once_they_have_entered(stay, left):
     assert made.remove() is (ALL_AGENTS not in stay)
     assert made.entered == ["b", "wall", "late"]
     assert ("late" in road.vehicles) == (ALL_AGENTS in stay)
-
-
-def test_hidden_vehicle_is_on_the_road_again_after_each_observation():
-    road, seen = SimpleNamespace(vehicles=["ego", "b", "c"]), []
-
-    def look():
-        seen.append(road.vehicles)
-        if len(seen) == 2:
-            raise KeyError
-        return "seen"
-
-    seeing = SimpleNamespace(observe=look)
-    made = Hidden(road, seeing, "b")
-    assert made.how_strong == 1.0
-    assert seeing.observe() == "seen"
-    made.keep()
-    with pytest.raises(KeyError):
-        seeing.observe()
-    made.end()
-    assert seeing.observe() == "seen"
-    assert seen == [["ego", "c"], ["ego", "c"], ["ego", "b", "c"]]
-    assert road.vehicles == ["ego", "b", "c"]
 
 
 @pytest.mark.parametrize(
