@@ -285,11 +285,6 @@ def run_alone(
 ) -> Iterator[EndedRun]:
     """Yield one run in a new Python process; its files exist until the iteration continues.
 
-    Args:
-        worker: settings of the trial, as for `Reruns`.
-        spec: specification of the trial.
-        stopped: function that returns whether to stop; called repeatedly.
-
     Raises:
         StoppedError: the user has stopped the run.
         CrashhuntError: the trial could not be run.

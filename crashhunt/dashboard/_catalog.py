@@ -49,12 +49,7 @@ class FoundHunt:
 
 
 class Catalog:
-    """The hunts in some folders and their subfolders, which are scanned for new hunts while requests arrive.
-
-    Args:
-        roots: the existing folders to search.
-        exported: folders of unpacked exports, by the name of the exported file.
-    """
+    """The hunts in some folders and their subfolders, which are scanned for new hunts while requests arrive."""
 
     def __init__(self, roots: Sequence[Path], exported: dict[str, Path] | None = None) -> None:
         self.roots = tuple(dict.fromkeys(root.resolve() for root in roots))

@@ -197,11 +197,7 @@ class Forkable:
 
 
 class FirstCopy:
-    """Makes one fork of the first episode of a process, to check that episodes can be forked.
-
-    Args:
-        refused: function called with the reason why the episode cannot be forked.
-    """
+    """Makes one fork of the first episode of a process, to check that episodes can be forked."""
 
     def __init__(self, refused: Callable[[str], None]) -> None:
         self._refused = refused

@@ -189,16 +189,7 @@ class UsualSteps(Protocol):
         self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int, int, int], roster: object,
         numbers: bytes, /,
     ) -> None:  # fmt: skip
-        """Record into a given buffer.
-
-        Args:
-            tape: The buffer.
-            offset: The offset of the next record.
-            reserved: The number of bytes that may be used.
-            tags: The tags of observation, action, step, lanes, roster and actors.
-            roster: The actors in sight, which have been recorded.
-            numbers: The payload of the record of this roster.
-        """
+        """Record into a given buffer."""
 
     def give_back(self) -> tuple[int, int, Any, list[tuple[Any, bytes]]]:
         """Stop recording; return the end of the records, the last complete step, the last roster, and all steps.

@@ -186,13 +186,7 @@ class BlackBox:
         return self._roster
 
     def lend(self, steps: UsualSteps, roster: Roster, numbers: bytes) -> None:
-        """Let the core record the steps of one agent until another method of this black box is called.
-
-        Args:
-            steps: steps of the core to record.
-            roster: the actors of the first of these steps, which must have been recorded.
-            numbers: the payload of the record of this roster.
-        """
+        """Let the core record the steps of one agent until another method of this black box is called."""
         self._stop_core()
         self._roster = roster
         steps.borrow(self._map, self._offset, self._reserved, _CORE_TAGS, roster, numbers)

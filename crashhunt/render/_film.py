@@ -80,12 +80,7 @@ class Shot:
 
 
 class Layout:
-    """Positions of panels, next to the scene or below it, whichever makes the smaller picture; determined only once.
-
-    Args:
-        frame: width and height of the scene, in pixels.
-        labels: labels of all panels.
-    """
+    """Positions of panels, next to the scene or below it, whichever makes the smaller picture; determined only once."""
 
     def __init__(self, frame: tuple[int, int], labels: Sequence[str]) -> None:
         (width, height), (across, down), count = frame, _PANEL_PIXELS, len(labels)

@@ -120,13 +120,7 @@ def _pointwise_parts(formula: Formula, *, positive: bool) -> list[tuple[Formula,
 
 
 class _Part:
-    """A part of the formula without temporal operators, and its truth at each sample.
-
-    Args:
-        formula: the part.
-        favourable: the truth value that never causes a violation.
-        holds: function that returns whether the part holds at a sample.
-    """
+    """A part of the formula without temporal operators, and its truth at each sample."""
 
     __slots__ = ("favourable", "formula", "holds", "truths")
 

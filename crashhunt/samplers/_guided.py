@@ -160,12 +160,7 @@ _PATIENCE = 14  # trials of the model without progress, for each argument, in wh
 
 
 class Peaks:
-    """The peaks of criticality among trials without a crash.
-
-    Args:
-        trials: the trials, in the order of their numbers.
-        dimensions: number of arguments that vary.
-    """
+    """The peaks of criticality among trials without a crash."""
 
     def __init__(self, trials: Sequence[ScoredTrial], dimensions: int) -> None:
         self._trials = trials
@@ -208,13 +203,7 @@ _PRIOR = 2.0  # payoff of one imagined trial of the model, so that it is tried
 
 
 class Portfolio:
-    """Divides the trials between a model of criticality and Halton's sequence.
-
-    Args:
-        cube: the unit cube whose dimensions are the arguments that vary.
-        space: the space of the arguments, as distributions.
-        hunt: facts about the hunt, whose seed scrambles the sequence.
-    """
+    """Divides the trials between a model of criticality and Halton's sequence."""
 
     def __init__(self, cube: Cube, space: Space, hunt: HuntFacts) -> None:
         self._dimensions = cube.dimensions

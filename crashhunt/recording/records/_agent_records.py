@@ -30,11 +30,7 @@ PROLOGUE = RecordType(tag=1, name="prologue", topic="/prologue", form=TextForm()
 
 
 class ArrayForm(Form):
-    """The conversion of an array whose type is given in the prologue.
-
-    Args:
-        what: name of the `AgentChannel` field that contains the type.
-    """
+    """The conversion of an array whose type is given in the prologue."""
 
     messages: Mapping[str, Mapping[str, str]] = {
         "FloatArray": {"values": "float*"},
