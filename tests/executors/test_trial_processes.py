@@ -382,6 +382,8 @@ def test_output_of_a_trial_is_in_its_folder(process, monkeypatch, tmp_path):
     found._stack = (tmp_path / "null").open("w")
     monkeypatch.setattr(_trial_process, "_dup2", lambda *given, **more: redirected.append((given[1], more)))
     monkeypatch.setattr(_trial_process, "_close", lambda descriptor: closed.append(descriptor) or os.close(descriptor))
+    monkeypatch.setattr("faulthandler.disable", lambda: handled.append("disabled"))
+    monkeypatch.setattr("signal.signal", lambda *given: handled.append(given))
     monkeypatch.setattr("faulthandler.enable", lambda file: handled.append(file))
     monkeypatch.setattr("faulthandler.register", lambda number, file: handled.append((number, file)))
     folder = tmp_path / "trial"
@@ -393,7 +395,8 @@ def test_output_of_a_trial_is_in_its_folder(process, monkeypatch, tmp_path):
     assert len(closed) == 2
     assert (folder / layout.RUN_LOG).read_text() == "before"
     assert (folder / layout.STACK).stat().st_mode & 0o777 == 0o644
-    assert handled == [found._stack, (signal.SIGUSR1, found._stack)]
+    fatal = [(number, signal.SIG_DFL) for number in (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE)]
+    assert handled == ["disabled", *fatal, found._stack, (signal.SIGUSR1, found._stack)]
 
 
 def test_folder_that_is_gone_is_a_fault_of_the_machine(process, tmp_path):

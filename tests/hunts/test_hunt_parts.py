@@ -719,7 +719,7 @@ def test_error_in_the_confirmation_of_a_crash_leaves_it_to_the_end_of_the_hunt_a
     progress.replace = lambda crashes: setattr(progress, "crashes", crashes)
     confirmation = Confirmation(SimpleNamespace(confirm_one=confirm), None)
     confirmation.look(progress)
-    assert [asked.get(timeout=5) for _ in range(2)] == ["a", "b"]
+    assert [asked.get(timeout=300) for _ in range(2)] == ["a", "b"]
     confirmation.close(progress)
     assert [one.confirmed for one in progress.crashes] == [None, True]
     with pytest.raises(RuntimeError, match="a defect"):  # the end of the hunt confirms it again, and reports the error
