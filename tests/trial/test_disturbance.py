@@ -72,7 +72,7 @@ def test_data_that_make_no_sense_are_refused(change, says):
         (Disturbance(1, "above", "fly", 2.0, 1.0, "{ego}"), "the actor above of {ego}: fly 2 for 1 s"),
     ],
 )
-def test_words_of_nobody_of_no_strength_and_of_an_unknown_kind(disturbance, words):
+def test_words_name_the_actor_or_its_place_and_unknown_kinds_as_they_are(disturbance, words):
     assert disturbance.words == words
 
 
