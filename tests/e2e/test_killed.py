@@ -367,7 +367,7 @@ def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(t
     wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")], every_s=0.01)
     process.kill()
     process.communicate(timeout=300)
-    wait_for(lambda: not processes_of(toy.folder), timeout_s=10.0)
+    wait_for(lambda: not processes_of(toy.folder))
     assert len([*toy.folder.glob("h/.scratch-*")]) == 1
     toy.crashhunt("oracles")
     assert left_in(toy.folder) == []

@@ -207,7 +207,7 @@ class Killing:
 
     def see_that_nothing_is_left(self) -> None:
         """Run a command that removes what others left, and see that nothing is there."""
-        wait_for(lambda: not processes_of(self.base), timeout_s=20.0)
+        wait_for(lambda: not processes_of(self.base))
         places = [self.base / word for word in self.words if word in ("new", "h", "sumo", "saved", "many")]
         hunts = [path.parent for place in places for path in [*place.glob("ledger.*"), *place.glob("*/ledger.*")]]
         for hunt in {*hunts}:
@@ -333,7 +333,7 @@ def test_command_killed_at_random_moments_resumes_loses_no_row_and_leaves_nothin
         code, said = ended(process)
         assert "Traceback" not in said or "KeyboardInterrupt" in said, said
         assert code in (-with_what, 130, killing.code), (code, said)
-        wait_for(lambda: not processes_of(killing.base), timeout_s=20.0)
+        wait_for(lambda: not processes_of(killing.base))
         see_that_rows_are_kept(rows, killing.rows())
         rows = killing.rows()
         if drawn.random() < 0.5:  # else the same command, which is the next one, removes what is left
@@ -377,7 +377,7 @@ def test_two_commands_at_once_are_killed_and_the_next_ones_lose_no_row_and_leave
             for process in processes:
                 _, said = ended(process)
                 assert "Traceback" not in said or "KeyboardInterrupt" in said, said
-        wait_for(lambda: not processes_of(killing.base), timeout_s=20.0)
+        wait_for(lambda: not processes_of(killing.base))
         see_that_rows_are_kept(rows, killing.rows())
         rows = killing.rows()
         if again:  # else the same commands, which are the next ones, remove what is left
@@ -387,7 +387,7 @@ def test_two_commands_at_once_are_killed_and_the_next_ones_lose_no_row_and_leave
         dashboard = killing.shell.begin(*second)
         with read_continually(second) as read:
             code, said = ended(killing.shell.begin(*killing.words))
-            wait_for(lambda: read, timeout_s=60.0)
+            wait_for(lambda: read)
             dashboard.kill()
             ended(dashboard)
     else:
