@@ -428,19 +428,6 @@ def test_value_that_is_no_number_is_no_truth_value(make, monkeypatch, place, wha
     assert fix in error.fix
 
 
-@pytest.mark.parametrize(
-    "value", [True, 1, 2.5, np.True_, np.float32(1), np.array([1]), np.array([[True]]), np.array(3.0)]
-)
-def test_number_and_array_with_one_element_are_truth_values(make, value):
-    made = make(info="hit")
-    for flag in (value, value * 0):
-        made.reset(seed=1)
-        assert step(made, SEEN, np.array([0.5]), np.array(flag), np.array([flag * 0]), {})[1:3] == [0.5, bool(flag)]
-        made.reset(seed=1)
-        step(made, SEEN, 0.5, False, False, {"hit": flag})
-        assert bool(made.scene().contacts) is bool(flag)
-
-
 def test_nan_is_reported_once_for_each_value_and_is_no_crash(make, monkeypatch):
     made = make(danger="info.d", info="hit", reward_below=-5.0)
     monkeypatch.setattr(made._rule, "_function", lambda *_: math.nan)
@@ -471,14 +458,6 @@ def test_nan_as_the_end_of_an_episode_is_refused(make):
 )  # fmt: skip
 def test_nan_is_found_in_observations_of_any_space(observation, nan):
     assert _gymnasium.has_nan(observation) is nan
-
-
-def test_timeout_of_the_environment_itself_is_no_hang(make, monkeypatch):
-    def fails(self):
-        raise TimeoutError("no answer")
-
-    monkeypatch.setattr(Environment, "close", fails)
-    assert list(make().notices) == ["the environment 'm:Environment' cannot be closed: TimeoutError: no answer"]
 
 
 def test_close_that_does_not_return_is_stopped_and_named(make, monkeypatch):

@@ -116,14 +116,6 @@ def drive(simulator, steps=6, seed=3, action=1):
     return seen, simulator._env._parallel.log
 
 
-def test_seed_determines_the_actions_of_other_agents(tmp_path):
-    (_, one), (_, two) = (drive(simulator_of(tmp_path)) for _ in range(2))
-    assert one == two
-    assert [set(actions) for actions in one[:3]] == [set(Chase.possible_agents)] * 2 + [{"runner", "hunter_0"}]
-    assert {actions["runner"] for actions in one} == {1}
-    assert drive(simulator_of(tmp_path), seed=4)[1] != one
-
-
 def test_learner_is_the_first_agent_or_the_one_that_is_named(tmp_path):
     seen, _ = drive(simulator_of(tmp_path), steps=1)
     assert seen[0]["places"].shape == (3,)

@@ -80,24 +80,6 @@ def test_braking_is_hard_above_the_limit_of_the_type_or_of_the_scenario(braking,
         assert what == ([("ego", "f", decelerated)] if found else [])
 
 
-def test_braking_is_reported_once_and_for_the_vehicle_that_was_behind(braking, sumo):
-    made = braking()
-    assert len(after(made, 20.0, 17.0)) == 1
-    assert made.lately == {"f": ("ego", 0.5)}
-    assert not made.is_quiet
-    assert after(made, 17.0, 14.0) == []  # the same braking goes on
-    assert after(made, 14.0, 14.0) == []
-    assert made.is_quiet
-    assert len(after(made, 14.0, 11.0)) == 1
-    sumo.answers["vehicle_getFollower"] = ("", -1.0)
-    other = braking()
-    assert after(other, 20.0, 17.0) == []  # it was not behind at the beginning of the step
-    assert len(after(other, 17.0, 14.0)) == 1  # it braked for the same vehicle in the step before
-    assert other.followers == {"ego": ""}
-    other.resume({"ego": "x"})
-    assert other.followers == {"ego": "x"}
-
-
 @pytest.mark.parametrize("name", ["ego2", "person p"])
 def test_braking_of_agents_and_persons_is_no_event(braking, name):
     made = braking(agents=("ego", "ego2"))
@@ -123,28 +105,10 @@ def test_vehicle_brakes_because_of_what_is_ahead_or_across(braking, sumo, leader
     assert [what.partition("with ego ")[2] for _, _, what in found] == ([where] if where else [])
 
 
-def test_limits_are_read_once(braking, sumo):
-    made = braking()
-    after(made, 20.0, 17.0)
-    sumo.answers["vehicle_getDecel"] = 99.0
-    after(made, 17.0, 14.0)
-    assert made.counted == ({"f": 4.0}, 0.0)
-    assert braking(3.0).counted == ({}, 3.0)
-
-
 def test_agent_that_has_left_has_no_follower(braking):
     made = braking(agents=("ego", "away"))
     after(made, 10.0, 10.0, agents=("ego", "away"))
     assert made.followers == {"ego": "f"}
-
-
-def test_decelerations_are_compared_where_the_core_has_found_one(braking):
-    for least, count in ((-1.01, 1), (-1.0, 1), (-0.99, 0)):
-        last = scene_of(0.0, ego=(20.0, 0.0, 0.0, 10.0), f=(0.0, 0.0, 0.0, 20.0))
-        scene = scene_of(0.5, ego=(25.0, 0.0, 0.0, 10.0), f=(5.0, 0.0, 0.0, 17.0))
-        last.columns, scene.columns = 3.0, 4.0
-        scene.core = SimpleNamespace(least_change=lambda one, two, least=least: least * (two - one))
-        assert len(braking().look(last, scene, ("ego",), {})) == count
 
 
 # Other events.

@@ -247,13 +247,6 @@ def test_actor_is_hidden_if_and_only_if_every_slow_ray_hits_something_else_first
     assert surely & cars <= {other for other in cars if scene.roster.actors[other].id not in hidden} <= nearly
 
 
-def test_actor_behind_a_lorry_is_hidden_until_it_looks_out():
-    lorry = (30.0, 0.0, 0.0, 12.0, 2.5, 0.0)
-    for y, is_hidden in ((0.0, True), (1.0, True), (3.5, False)):
-        scene = scene_of((0.0, 0.0, 0.0, 4.0, 1.8, 0.0), lorry, (60.0, y, 0.0, 4.0, 1.8, 0.0))
-        assert (occluded(scene, 0, RayCaster(3600, 120.0)) == {"a2"}) == is_hidden, y
-
-
 @pytest.mark.parametrize(("seed", "agent", "step"), [(2, "ego", 3), (1, "other", 3), (1, "ego", 4)])
 def test_noise_of_ranges_differs_between_seeds_agents_and_steps(seed, agent, step):
     settings = {"noise": 0.5, "range": 50.0}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import gc
-import logging
 import os
 import subprocess
 import sys
@@ -310,17 +309,6 @@ def test_a_method_of_one_vehicle_is_called():
     road.act()
     road.step(0.1)
     assert called == ["act"]
-
-
-def test_it_states_which_it_leaves_alone(caplog):
-    class Odd(IDMVehicle):
-        def mobil(self, lane_index):
-            return False
-
-    with caplog.at_level(logging.INFO, "crashhunt"):
-        assert kind_of(Odd).drives == ""
-        assert kind_of(Odd).moves
-    assert "Odd has its own mobil" in caplog.text
 
 
 def test_it_steps_aside_for_another_version(monkeypatch):

@@ -365,19 +365,6 @@ def test_usual_change_of_the_target_speed_needs_no_code_of_highway_env():
     assert not _substep_loop.choose(env, 3)
 
 
-def test_step_of_an_onlooker_calls_its_functions_in_order():
-    calls = []
-    onlooker = Onlooker(lambda dt: calls.append(dt), before=lambda dt: calls.append(-dt), after=lambda: calls.append(0))
-    onlooker(0.5)
-    assert calls == [-0.5, 0.5, 0]
-    assert not onlooker.interferes()
-    assert not onlooker.waits()
-    plain = Onlooker(lambda dt: calls.append(dt))
-    plain(0.25)
-    plain.look()
-    assert calls[3:] == [0.25]
-
-
 def road_with(step):
     place = small_road(IDMVehicle)
     if step is not None:
