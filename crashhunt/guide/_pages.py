@@ -65,19 +65,12 @@ _FENCED = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page of the guide.
+    """A page of the guide."""
 
-    Args:
-        topic: unique name of the page on the command line.
-        section: folder that contains the page; empty for the top folder.
-        title: heading of the page.
-        file: the Markdown file, in which some comments are placeholders for generated parts.
-    """
-
-    topic: str
-    section: str
-    title: str
-    file: Path
+    topic: str  # unique name of the page on the command line
+    section: str  # folder that contains the page; empty for the top folder
+    title: str  # heading of the page
+    file: Path  # the Markdown file, in which some comments are placeholders for generated parts
 
     def text(self, parser: argparse.ArgumentParser) -> str:
         """Return the whole page as Markdown."""

@@ -9,17 +9,11 @@ from crashhunt.guide._pages import Page, list_pages
 
 
 class FoundPage(NamedTuple):
-    """A page that contains the words of a search.
-
-    Args:
-        page: the page.
-        heading: heading of the section that fits best; empty for the beginning of the page.
-        score: how well the section fits.
-    """
+    """A page that contains the words of a search."""
 
     page: Page
-    heading: str
-    score: int
+    heading: str  # heading of the section that fits best; empty for the beginning of the page
+    score: int  # how well the section fits
 
 
 def search_pages(text: str) -> list[FoundPage]:

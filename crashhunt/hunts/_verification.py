@@ -126,22 +126,15 @@ _END, _JUDGE, _CONFIRM = range(3)  # what the thread does first
 
 @dataclass(frozen=True, slots=True)
 class TrialReruns:
-    """Runs trials of a hunt again.
+    """Runs trials of a hunt again."""
 
-    Args:
-        setup: the parts of the hunt that do not change.
-        ledger: ledger of the hunt, which records the snapshot of each trial.
-        progress: progress of the hunt: a line is added to its notes for each problem, and to its failed runs those that
-            should have confirmed a crash, but ended differently.
-        executors: the executors that run crashes again.
-        phases: object to which the progress of these runs is reported.
-    """
-
-    setup: HuntSetup
-    ledger: Ledger
+    setup: HuntSetup  # the parts of the hunt that do not change
+    ledger: Ledger  # ledger of the hunt, which records the snapshot of each trial
+    # progress of the hunt: a line is added to its notes for each problem, and to its failed runs those that should have
+    # confirmed a crash, but ended differently
     progress: Progress
-    executors: SharedReruns
-    phases: PhaseClock
+    executors: SharedReruns  # the executors that run crashes again
+    phases: PhaseClock  # object to which the progress of these runs is reported
 
     @property
     def is_stopped(self) -> bool:
@@ -272,19 +265,12 @@ def is_settled(bundle: Bundle) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RepeatedTrial:
-    """A trial that has been run again.
+    """A trial that has been run again."""
 
-    Args:
-        ended: the second run.
-        runs: the object that ran the trial.
-        snapshot: digest of the snapshot that was run.
-        folder: subfolder of the hunt's directory for the bundle.
-    """
-
-    ended: EndedRun
-    runs: TrialReruns
-    snapshot: str
-    folder: str
+    ended: EndedRun  # the second run
+    runs: TrialReruns  # the object that ran the trial
+    snapshot: str  # digest of the snapshot that was run
+    folder: str  # subfolder of the hunt's directory for the bundle
 
     @property
     def result(self) -> TrialResult:
@@ -314,16 +300,12 @@ class ForkCrash:
 
 @dataclass(frozen=True, slots=True)
 class VerificationRuns:
-    """Runs crashes of forks from the start, to verify them.
+    """Runs crashes of forks from the start, to verify them."""
 
-    Args:
-        again: object that runs trials of the hunt again.
-        disturber: object that computes the likelihood of disturbances; None if the hunt has no disturbance models.
-        kept: the crashes that have already been run, by folder and trial; they are not run again.
-    """
-
-    again: TrialReruns
+    again: TrialReruns  # object that runs trials of the hunt again
+    # object that computes the likelihood of disturbances; None if the hunt has no disturbance models
     disturber: DisturbanceSampler | None
+    # the crashes that have already been run, by folder and trial; they are not run again
     kept: dict[str, dict[int, Bundle]] = field(default_factory=dict)
 
     @property

@@ -68,16 +68,11 @@ json.dump([names, is_open, defaults], answer)
 
 @dataclass(frozen=True, slots=True)
 class Takes:
-    """The arguments that an agent accepts.
+    """The arguments that an agent accepts."""
 
-    Args:
-        names: names of the arguments that the agent declares.
-        open: whether the agent accepts any other argument as well (``**kwargs``).
-        defaults: defaults of the arguments whose default is a number, a string or a Boolean.
-    """
-
-    names: Collection[str] = ()
-    open: bool = False
+    names: Collection[str] = ()  # names of the arguments that the agent declares
+    open: bool = False  # whether the agent accepts any other argument as well (``**kwargs``)
+    # defaults of the arguments whose default is a number, a string or a Boolean
     defaults: Mapping[str, Value] = field(default_factory=dict)
 
 

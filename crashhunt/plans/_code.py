@@ -38,23 +38,16 @@ IMPORT_S = 60.0  # besides the time limit of a trial
 
 @dataclass(frozen=True, slots=True)
 class CodeFacts:
-    """The declarations of the code that a hunt names: of its agents, user-defined oracles and disturbances.
+    """The declarations of the code that a hunt names: of its agents, user-defined oracles and disturbances."""
 
-    Args:
-        signatures: arguments of each agent, by the agent's locator.
-        oracles: outcomes of each user-defined oracle with their categories, by the text that chooses the oracle in
-            ``--oracle``.
-        disturbances: the kind of each user-defined disturbance model, by name.
-        imported: the modules that a process with all of this code has imported; None if all modules are crashhunt's
-            own.
-        notes: what the user should know, as lines of text.
-    """
-
-    signatures: Mapping[str, CallSignature]
+    signatures: Mapping[str, CallSignature]  # arguments of each agent, by the agent's locator
+    # outcomes of each user-defined oracle with their categories, by the text that chooses the oracle in ``--oracle``
     oracles: Mapping[str, Mapping[str, Category]] = field(default_factory=dict)
+    # the kind of each user-defined disturbance model, by name
     disturbances: Mapping[str, str] = field(default_factory=dict)
+    # the modules that a process with all of this code has imported; None if all modules are crashhunt's own
     imported: ImportedModules | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what the user should know, as lines of text
 
 
 def describe_code(

@@ -43,17 +43,11 @@ _START_FIX = "start a cluster with 'ray start --head', or give the address of a 
 
 
 class Meant(NamedTuple):
-    """The cluster that the user has chosen.
+    """The cluster that the user has chosen."""
 
-    Attributes:
-        address: the address ``HOST:PORT`` of the cluster; empty for the hunt's own cluster.
-        environment: additional environment variables for Ray.
-        spare: further environment variables for a cluster that requires a token.
-    """
-
-    address: str
-    environment: dict[str, str]
-    spare: dict[str, str]
+    address: str  # the address ``HOST:PORT`` of the cluster; empty for the hunt's own cluster
+    environment: dict[str, str]  # additional environment variables for Ray
+    spare: dict[str, str]  # further environment variables for a cluster that requires a token
 
 
 def require_ray() -> None:

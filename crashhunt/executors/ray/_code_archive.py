@@ -34,17 +34,11 @@ _SCENARIO, _CODE, _FILES = "scenario", "code", "files"
 
 @dataclass(frozen=True, slots=True)
 class CodeArchive:
-    """The files that trials need, and the folders on the hunt's machine that they replace.
+    """The files that trials need, and the folders on the hunt's machine that they replace."""
 
-    Args:
-        files: path of each file, by its place in the archive.
-        folders: place in the archive of each folder or file of the hunt's machine, for `settings_in`.
-        home: place in the archive of the current folder; empty if the archive does not contain it.
-    """
-
-    files: dict[str, Path]
-    folders: dict[str, str]
-    home: str = ""
+    files: dict[str, Path]  # path of each file, by its place in the archive
+    folders: dict[str, str]  # place in the archive of each folder or file of the hunt's machine, for `settings_in`
+    home: str = ""  # place in the archive of the current folder; empty if the archive does not contain it
 
     @classmethod
     def of(cls, settings: WorkerSettings) -> CodeArchive:

@@ -72,34 +72,19 @@ class FromBridge(TypedDict, total=False):
 
 
 class NodeTrial(NamedTuple):
-    """A trial that has ended on a node.
+    """A trial that has ended on a node."""
 
-    Attributes:
-        ticket: ticket with which the trial was submitted.
-        number: number of the trial in the hunt.
-        line: the message for the hunt, which the bridge forwards without reading it.
-        files: compressed files of the trial's scratch folder by name, if the trial is kept.
-    """
-
-    ticket: int
-    number: int
-    line: bytes
-    files: dict[str, bytes]
+    ticket: int  # ticket with which the trial was submitted
+    number: int  # number of the trial in the hunt
+    line: bytes  # the message for the hunt, which the bridge forwards without reading it
+    files: dict[str, bytes]  # compressed files of the trial's scratch folder by name, if the trial is kept
 
 
 class News(NamedTuple):
-    """The events on a node since the previous call.
+    """The events on a node since the previous call."""
 
-    Attributes:
-        ended: trials that have ended.
-        where: progress of each running trial, by number; None if it was not requested.
-        notes: texts for the user.
-        error: reason why no trial can run on the node; None if trials can run.
-        map: compressed map of all trials, sent with the first kept trial.
-    """
-
-    ended: list[NodeTrial]
-    where: dict[int, Header] | None
-    notes: list[str]
-    error: ErrorData | None
-    map: bytes
+    ended: list[NodeTrial]  # trials that have ended
+    where: dict[int, Header] | None  # progress of each running trial, by number; None if it was not requested
+    notes: list[str]  # texts for the user
+    error: ErrorData | None  # reason why no trial can run on the node; None if trials can run
+    map: bytes  # compressed map of all trials, sent with the first kept trial
