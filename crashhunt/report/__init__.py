@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._argument_words import argument_units as argument_units
     from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
     from ._crash_text import Story as Story, describe_note as describe_note
     from ._crash_types_table import describe_causes as describe_causes, describe_groups as describe_groups
@@ -63,7 +64,6 @@ if TYPE_CHECKING:
         scorecard_table as scorecard_table,
     )
     from ._step_table import (
-        argument_units as argument_units,
         check_fields as check_fields,
         format_table as format_table,
         steps_table as steps_table,

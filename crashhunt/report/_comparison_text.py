@@ -10,8 +10,8 @@ import numpy as np
 
 from crashhunt.base.files import whole_file
 from crashhunt.base.text import aligned, count_of, format_number, in_lines
+from crashhunt.report._argument_words import argument_units
 from crashhunt.report._rate_text import count_training_trials
-from crashhunt.report._step_table import argument_units
 from crashhunt.results import FACTS, HuntResults, columns_of
 from crashhunt.statistics import PER_WORDS, held_out_by_seed
 from crashhunt.trial import Outcome, in_order

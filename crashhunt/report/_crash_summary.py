@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.text import command_line, count_of
 from crashhunt.crashes import own_frames
+from crashhunt.report._argument_words import format_inputs
 from crashhunt.report._disturbance_words import list_disturbances
-from crashhunt.report._live_screen import format_inputs
 from crashhunt.trial import BAD_ACTION
 
 if TYPE_CHECKING:

@@ -23,6 +23,7 @@ from crashhunt.crashes import (
     subject_of,
 )
 from crashhunt.recording import describe_value, is_opaque
+from crashhunt.report._argument_words import draw_signals, format_inputs, input_signals
 from crashhunt.report._cause_words import about_why
 from crashhunt.report._crash_summary import innermost_calls
 from crashhunt.report._disturbance_words import about_disturbances
@@ -47,7 +48,6 @@ from crashhunt.report._judgement_words import (
     about_judgement,
     about_reference,
 )
-from crashhunt.report._live_screen import draw_signals, format_inputs, input_signals
 from crashhunt.report._step_table import NEAREST, TableCell, describe_action, is_wide, stacked, steps_table
 from crashhunt.scenario import ACTIONS
 

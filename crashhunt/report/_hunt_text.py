@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line, count_of, in_lines, out_of
+from crashhunt.report._argument_words import format_arguments
 from crashhunt.report._crash_summary import describe_crash
 from crashhunt.report._disturbance_words import (
     by_likelihood,
@@ -15,7 +16,7 @@ from crashhunt.report._disturbance_words import (
     describe_probes,
 )
 from crashhunt.report._judgement_words import fault_words
-from crashhunt.report._live_screen import describe_types, format_arguments, format_seconds
+from crashhunt.report._live_screen import describe_types, format_seconds
 from crashhunt.report._rate_text import describe_rates
 from crashhunt.report._version_words import describe_versions
 from crashhunt.world import event_counts

@@ -12,10 +12,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from crashhunt.base.text import count_of, format_number, format_percent, one_line, out_of
+from crashhunt.base.text import count_of, format_percent, one_line, out_of
 from crashhunt.recording import Phase
+from crashhunt.report._argument_words import format_arguments
 from crashhunt.report._rate_text import describe_running
-from crashhunt.trial import InputSignal, Outcome, fold_signals, without_folder
+from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,14 +25,13 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
     from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
-    from crashhunt.trial import TrialResult, Value
+    from crashhunt.trial import TrialResult
 
 _LINE_EVERY_S = 5.0  # where lines cannot be overwritten, such as in a CI log
 _MIN_SCREEN_LINES = 16  # lines; on a lower screen, workers need the space
 _LINES_BELOW_TYPES = 6  # lines; for the search, the nearest miss and the like
 _MIN_TYPE_LINES = 2  # lines
 _MIN_BAR_COLUMNS = 8  # columns; a shorter bar is unreadable, and the words need the space
-_CURVE_COLUMNS, _LEVELS = 30, "▁▂▃▄▅▆▇█"  # of the curve of an argument over time
 _STYLES = {
     "traffic crash": "bold red",
     "traffic event": "bold yellow",
@@ -222,57 +222,6 @@ def _workers(status: HuntStatus, width: int, lines: int) -> RenderableType:
     for first in range(0, len(cells), columns):
         workers.add_row(*cells[first : first + columns])
     return workers
-
-
-def format_arguments(result: TrialResult) -> str:
-    """Return the arguments of a trial as one line."""
-    spec = result.spec
-    alone = len(spec.arguments) == 1
-    pairs = [
-        (name if alone else f"{agent}.{name}", value)
-        for agent, values in spec.arguments.items()
-        for name, value in values.items()
-    ]
-    pairs += list(spec.scenario_arguments.items())
-    return " ".join(f"{name}={_short(value)}" for name, value in pairs)
-
-
-def input_signals(result: TrialResult) -> dict[str, InputSignal]:
-    """Return the arguments of a trial that are signals, by name as `format_arguments` writes it."""
-    spec = result.spec
-    owners = ((f"{agent}." * (len(spec.arguments) > 1), given) for agent, given in spec.arguments.items())
-    return {
-        f"{whose}{name}": value
-        for whose, given in (*owners, ("", spec.scenario_arguments))
-        for name, value in fold_signals(given).items()
-        if isinstance(value, InputSignal)
-    }
-
-
-def draw_signals(result: TrialResult) -> list[str]:
-    """Return a line for each argument that is a signal: its curve over time, and its range."""
-    lines = []
-    for name, signal in input_signals(result).items():
-        values = [signal((place + 0.5) / _CURVE_COLUMNS * signal.duration_s) for place in range(_CURVE_COLUMNS)]
-        low, high = min(signal.points), max(signal.points)
-        levels = [round((value - low) / (high - low) * (len(_LEVELS) - 1)) if high > low else 0 for value in values]
-        curve = "".join(_LEVELS[max(0, min(len(_LEVELS) - 1, level))] for level in levels)
-        count = count_of(len(signal.points), "point")
-        lines.append(
-            f"{name} over {signal.duration_s:g} s: {curve} from {low:.4g} to {high:.4g} ({signal.kind}, {count})"
-        )
-    return lines
-
-
-def format_inputs(result: TrialResult) -> str:
-    """Return the seed and the arguments of a trial as one line."""
-    return ", ".join(filter(None, (f"seed {result.spec.seed}", format_arguments(result))))
-
-
-def _short(value: Value) -> str:
-    if isinstance(value, float):
-        return format_number(value).replace(",", "")  # so that it can be copied
-    return without_folder(value)
 
 
 def format_pace(rate_per_s: float) -> str:

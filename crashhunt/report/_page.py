@@ -23,14 +23,13 @@ from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes, read_obstacles
+from crashhunt.report._argument_words import argument_units, format_arguments
 from crashhunt.report._crash_text import Story, describe_note
 from crashhunt.report._disturbance_words import by_likelihood, may_be_disturbed, traffic_of
 from crashhunt.report._headline import last_avoidable, verdict_of
 from crashhunt.report._judgement_words import NOT_DECIDED, fault_words
-from crashhunt.report._live_screen import format_arguments
 from crashhunt.report._player_layers import packed_floats, player_layers
 from crashhunt.report._rate_text import describe_running
-from crashhunt.report._step_table import argument_units
 from crashhunt.report._version_words import describe_versions
 from crashhunt.results import CodeVersions, TrialRow, count_versions, find_crashes
 from crashhunt.simulators import TRAJECTORY_SHAPE

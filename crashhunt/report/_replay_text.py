@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import aligned, command_line, in_lines
-from crashhunt.report._live_screen import format_inputs
+from crashhunt.report._argument_words import format_inputs
 
 if TYPE_CHECKING:
     from crashhunt.replays import ReplayReport

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.plugins import locate
+from crashhunt.base.errors import UsageError
 from crashhunt.base.text import aligned, did_you_mean
 from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
 from crashhunt.scenario import ACTIONS
 from crashhunt.simulators import TRAJECTORY_SHAPE
-from crashhunt.snapshots import latest_snapshot
-from crashhunt.trial import signature_of
 from crashhunt.world import approaches, join_frames
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from crashhunt.plans import HuntSettings
     from crashhunt.recording import AgentChannel, Recording, StepRecord
 
 
@@ -191,30 +185,3 @@ def _format(value: TableCell) -> str:
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-# The units of a hunt's arguments, for the axes of plots.
-
-
-def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, str], str]:
-    """Return the known units of arguments. The keys are (agent, or empty for the scenario; name of the argument).
-
-    The units come from the snapshot's scenario and from the signatures of crashhunt's agents. No code of a bundle runs.
-    """
-    try:
-        found = latest_snapshot(directory)
-        scenario = found.scenario() if found is not None else None
-    except CrashhuntError:  # a page without units is better than none
-        scenario = None
-    units = {} if scenario is None else {("", name): setup.unit for name, setup in scenario.arguments.items()}
-    for agent, chosen in settings.agents.items():
-        if chosen.agent.startswith("crashhunt.agents:"):
-            # Another version of crashhunt may have an agent that this one does not have.
-            with suppress(CrashhuntError):
-                arguments = signature_of(locate("agents", chosen.agent)).arguments
-                units |= {(agent, name): argument.unit for name, argument in arguments.items()}
-        setup = scenario.agents.get(agent) if scenario is not None else None
-        if setup is not None and setup.agent == chosen.agent:
-            units |= {(agent, name): known.unit for name, known in setup.arguments.items() if known.unit}
-    # "vehicles (vehicles)" says nothing.
-    return {(agent, name): unit for (agent, name), unit in units.items() if unit and unit != name}

@@ -18,7 +18,8 @@ from crashhunt.hunts import HuntStatus, PhaseStatus, SearchStatus
 from crashhunt.hunts._progress import StrategyStatus
 from crashhunt.recording import BlackBoxHeader, Phase
 from crashhunt.report import Watcher, describe_running
-from crashhunt.report._live_screen import _line, _nearest_words, describe_kinds, format_inputs
+from crashhunt.report._argument_words import format_inputs
+from crashhunt.report._live_screen import _line, _nearest_words, describe_kinds
 from crashhunt.trial import Disturbance, Outcome, Stress, TrialResult, TrialSpec
 from crashhunt.world import ClosestApproach
 

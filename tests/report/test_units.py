@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crashhunt.plans import AgentSettings, HuntSettings
-from crashhunt.report._step_table import argument_units
+from crashhunt.report._argument_words import argument_units
 
 
 @pytest.mark.parametrize("agent", ["crashhunt.agents:OfALaterVersion", "an-agent-that-is-not-installed", "mine:Agent"])
