@@ -393,3 +393,10 @@ def test_the_right_of_way_decides_where_lanes_cross_and_no_light_does():
 def test_the_safe_gap_is_that_of_rss():
     assert safe_gap_m(20, 20) == pytest.approx(20 + 1.75 + 23.5**2 / 8 - 20**2 / 16)
     assert safe_gap_m(0, 30) == 0
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_who_meets_the_other_sideways_is_the_same_in_every_direction(angle):
+    case = drive(straight(20, 1.0, 0.5), turning_left(1.2, at=11.0))
+    for actor in ("ego", "other"):
+        assert rotated(case, angle).meets_sideways(actor) == case.meets_sideways(actor)
