@@ -306,6 +306,7 @@ def test_scenes_of_the_oracle_contract_have_what_their_description_states():
         assert all((contact.collider, contact.victim) == ("ego", "other") for contact in scene.contacts)
         assert (scene.off_road == ("ego",)) == (number > 55)
         assert [event.kind for event in scene.events] == (["red_light"] if number == 20 else [])
+        assert [(event.x, event.y, event.speed) for event in scene.events] == [(*ego, scene.speeds[0])] * (number == 20)
         assert scene.previous is (scenes[number - 1] if number else None)
         assert scene.swept == (number > 0)
         for contact in scene.contacts:
