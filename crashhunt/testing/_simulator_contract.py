@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,8 @@ from crashhunt.simulators import (
 from crashhunt.trial import CELLS, Disturbance, Outcome
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from crashhunt.simulators import Observations
     from crashhunt.world import Event
 
@@ -55,14 +57,25 @@ class SimulatorContract:
         """Return a function that creates a simulator."""
         raise NotImplementedError("the test class must define the fixture 'make'")
 
+    @pytest.fixture
+    def simulator(self, make: Make) -> Iterator[Simulator]:
+        """Yield a simulator, and close it at the end of the test."""
+        simulator = make()
+        yield simulator
+        simulator.close()
+
+    def _held(self, simulator: Simulator, seed: int = 3) -> dict[str, NDArray[np.generic]]:
+        """Return the first encoded sample from the action space of each agent."""
+        forms = {agent: simulator.actions[agent] for agent in simulator.agents}
+        for form in forms.values():
+            form.space.seed(seed)
+        return {agent: form.encode(form.space.sample()) for agent, form in forms.items()}
+
     def _drive(self, simulator: Simulator, seed: int, reseeded: tuple[int, int] | None = None) -> list[_Shown]:
         """Return all outputs of an episode, as bytes and numbers."""
         observations, _ = simulator.reset(seed=seed)
         trace: list[_Shown] = [self._shown(simulator, observations, {})]
-        held = {}
-        for agent in simulator.agents:
-            simulator.actions[agent].space.seed(3)
-            held[agent] = simulator.actions[agent].encode(simulator.actions[agent].space.sample())
+        held = self._held(simulator)
         for step in range(self.steps):
             if reseeded is not None and step == reseeded[0]:
                 assert supports(simulator, SupportsReseeding)
@@ -106,18 +119,15 @@ class SimulatorContract:
             found += simulator.scene().events
         return found
 
-    def test_an_episode_depends_on_its_seed_alone(self, make: Make) -> None:
+    def test_an_episode_depends_on_its_seed_alone(self, simulator: Simulator) -> None:
         """Equal seeds give equal episodes after any other episodes, and another seed gives another episode."""
-        simulator = make()
         first = self._drive(simulator, 1)
         other = self._drive(simulator, 2)
         assert self._drive(simulator, 1) == first
         assert other != first
-        simulator.close()
 
-    def test_another_seed_within_an_episode_changes_only_what_follows(self, make: Make) -> None:
+    def test_another_seed_within_an_episode_changes_only_what_follows(self, simulator: Simulator) -> None:
         """After another seed is set at a step, the earlier steps stay equal, and equal seeds give equal episodes."""
-        simulator = make()
         if supports(simulator, SupportsReseeding) and not simulator.why_no_reseeding:
             first = self._drive(simulator, 1)
             after = max(0, len(first) // 2 - 1)
@@ -125,7 +135,6 @@ class SimulatorContract:
             assert again[0] == again[1]
             assert all(trace[: after + 1] == first[: after + 1] for trace in again)
             assert self._drive(simulator, 1) == first
-        simulator.close()
 
     def test_a_second_instance_does_the_same(self, make: Make) -> None:
         """The results do not depend on the instance of the simulator."""
@@ -136,31 +145,23 @@ class SimulatorContract:
         assert self._drive(two, 5) == first
         two.close()
 
-    def test_what_is_handed_out_stays_as_it_is(self, make: Make) -> None:
+    def test_what_is_handed_out_stays_as_it_is(self, simulator: Simulator) -> None:
         """Neither observations nor scenes that were returned change when the episode continues."""
-        simulator = make()
         observations, _ = simulator.reset(seed=1)
         scene = simulator.scene()
         kept = {agent: observation.copy() for agent, observation in observations.items()}
         data = scene.data
-        for agent in simulator.agents:
-            simulator.actions[agent].space.seed(1)
-        actions = {a: simulator.actions[a].encode(simulator.actions[a].space.sample()) for a in simulator.agents}
-        simulator.step(actions)
+        simulator.step(self._held(simulator, seed=1))
         assert all(np.array_equal(observations[agent], kept[agent]) for agent in kept)
         assert np.array_equal(scene.data, data)
-        simulator.close()
 
-    def test_time_grows_by_the_step_length(self, make: Make) -> None:
+    def test_time_grows_by_the_step_length(self, simulator: Simulator) -> None:
         """The simulation time of the scene increases by one step length in each step."""
-        simulator = make()
         times = [entry[0] for entry in self._drive(simulator, 1)]
         assert np.allclose(np.diff(times), simulator.step_length_s)
-        simulator.close()
 
-    def test_actions_are_checked_and_encoded_once_and_for_all(self, make: Make) -> None:
+    def test_actions_are_checked_and_encoded_once_and_for_all(self, simulator: Simulator) -> None:
         """Encoding an encoded action changes nothing, and actions outside of the space are refused."""
-        simulator = make()
         simulator.reset(seed=1)
         for agent in simulator.agents:
             form = simulator.actions[agent]
@@ -173,20 +174,16 @@ class SimulatorContract:
             for nonsense in (None, "fast", (np.nan, np.nan), object(), (1e300, 7), -1, 0.5, [[]]):
                 with pytest.raises(ActionError):
                     form.encode(nonsense)
-        simulator.close()
 
-    def test_it_offers_faculties_as_a_whole(self, make: Make) -> None:
+    def test_it_offers_faculties_as_a_whole(self, simulator: Simulator) -> None:
         """A simulator with one method of an optional protocol has all its methods, or the protocol is ignored."""
-        simulator = make()
         simulator.reset(seed=1)
         for faculty in FACULTIES:
             there = [name for name in members(faculty) if getattr(simulator, name, None) is not None]
             assert there in ([], [*members(faculty)]), f"{faculty.__name__} is offered in part: {there}"
-        simulator.close()
 
-    def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, make: Make) -> None:
+    def test_braking_as_hard_as_it_can_is_an_action_that_does_not_speed_up(self, simulator: Simulator) -> None:
         """The action of `SupportsFullBraking` is inside the action space, and slows the vehicle down."""
-        simulator = make()
         simulator.reset(seed=1)
         names = tuple(simulator.agents)
         brakes: dict[str, FullBraking] = {}
@@ -207,11 +204,9 @@ class SimulatorContract:
             scene = simulator.scene()
             row = scene.roster.index.get(agent)
             assert row is None or scene.speeds[row] <= before + 1e-6
-        simulator.close()
 
-    def test_the_map_has_every_lane_once(self, make: Make) -> None:
+    def test_the_map_has_every_lane_once(self, simulator: Simulator) -> None:
         """`HasMap`: every lane has a unique name, a width and at least two points, and the lanes do not change."""
-        simulator = make()
         simulator.reset(seed=1)
         if supports(simulator, HasMap):
             lanes = list(simulator.lanes())
@@ -222,11 +217,9 @@ class SimulatorContract:
                 assert len(lane.shape) > 1
                 assert np.isfinite(lane.shape).all()
             assert list(simulator.lanes()) == lanes
-        simulator.close()
 
-    def test_obstacles_are_closed_lines(self, make: Make) -> None:
+    def test_obstacles_are_closed_lines(self, simulator: Simulator) -> None:
         """`HasObstacles`: every obstacle has a unique name and a closed outline; the simulator has a map as well."""
-        simulator = make()
         simulator.reset(seed=1)
         if supports(simulator, HasObstacles):
             assert supports(simulator, HasMap)
@@ -238,11 +231,9 @@ class SimulatorContract:
                 assert len(one.shape) > 3
                 assert one.shape[0] == one.shape[-1]
                 assert np.isfinite(one.shape).all()
-        simulator.close()
 
-    def test_structured_observations_can_be_had_back(self, make: Make) -> None:
+    def test_structured_observations_can_be_had_back(self, simulator: Simulator) -> None:
         """`FlattensObservations`: the agent's observation is unflattened from the recorded one, and vice versa."""
-        simulator = make()
         observations, _ = simulator.reset(seed=1)
         shown = simulator.shown_spaces if supports(simulator, FlattensObservations) else {}
         assert set(shown) <= set(observations)
@@ -253,14 +244,12 @@ class SimulatorContract:
             seen: object = spaces.unflatten(space, observations[agent])
             again = np.asarray(spaces.flatten(space, seen))
             assert np.array_equal(again, observations[agent], equal_nan=True)
-        simulator.close()
 
-    def test_columns_have_a_name_each(self, make: Make) -> None:
+    def test_columns_have_a_name_each(self, simulator: Simulator) -> None:
         """`NamesObservations`: each entry of an observation's last axis has a name, or no entry has one.
 
         The names are not those of agents that observe parts (`ObservesParts`).
         """
-        simulator = make()
         observations, _ = simulator.reset(seed=1)
         layouts = simulator.observation_layouts if supports(simulator, ObservesParts) else {}
         observations = {agent: shown for agent, shown in observations.items() if agent not in layouts}
@@ -268,41 +257,31 @@ class SimulatorContract:
         assert all(isinstance(name, str) for name in names)
         assert len(set(names)) == len(names)
         assert not names or all(observation.shape[-1] == len(names) for observation in observations.values())
-        simulator.close()
 
-    def test_parts_are_those_of_the_layout(self, make: Make) -> None:
+    def test_parts_are_those_of_the_layout(self, simulator: Simulator) -> None:
         """`ObservesParts`: an agent that observes parts sees arrays in the spaces of its layout."""
-        simulator = make()
         observations, _ = simulator.reset(seed=1)
         for agent, layout in (simulator.observation_layouts if supports(simulator, ObservesParts) else {}).items():
             assert simulator.observation_spaces[agent] == layout.flat_space
             seen = layout.restore(observations[agent])
             assert layout.space.contains(seen)
             assert layout.flat(seen).tobytes() == observations[agent].tobytes()
-        simulator.close()
 
-    def test_only_events_that_it_looks_for_happen(self, make: Make) -> None:
+    def test_only_events_that_it_looks_for_happen(self, simulator: Simulator) -> None:
         """`ReportsEvents`: scenes have only events of the reported types; without the protocol, they have none."""
-        simulator = make()
         kinds = tuple(simulator.reported_events) if supports(simulator, ReportsEvents) else ()
         assert {Outcome(kind).is_traffic_event for kind in kinds} <= {True}
         assert {event.kind for event in self._events(simulator)} <= set(kinds)
-        simulator.close()
 
-    def test_others_err_and_the_next_episode_knows_nothing_of_it(self, make: Make) -> None:
+    def test_others_err_and_the_next_episode_knows_nothing_of_it(self, simulator: Simulator) -> None:
         """`SupportsDisturbances`: a target is in the scene and is not an agent; `reset` ends every disturbance."""
-        simulator = make()
         if not supports(simulator, SupportsDisturbances):
-            simulator.close()
             return
         assert all(isinstance(kind, str) for kind in simulator.disturbing_kinds)
         before = self._drive(simulator, 1)
         for number, kind in enumerate(simulator.disturbing_kinds):
             simulator.reset(seed=1)
-            agents = tuple(simulator.agents)
-            for agent in agents:
-                simulator.actions[agent].space.seed(3)
-            held = {name: simulator.actions[name].encode(simulator.actions[name].space.sample()) for name in agents}
+            agents, held = tuple(simulator.agents), self._held(simulator)
             found = {}
             for cell in CELLS:
                 planned = Disturbance(step=1, who=cell, what=kind, how_strong=0.5, how_long=1.0, agent=agents[0])
@@ -319,21 +298,17 @@ class SimulatorContract:
             for disturbed in active[number % 2 :: 2]:  # the others continue to the end
                 disturbed.end()
         assert self._drive(simulator, 1) == before
-        simulator.close()
 
-    def test_notices_are_lines(self, make: Make) -> None:
+    def test_notices_are_lines(self, simulator: Simulator) -> None:
         """`ReportsNotices`: each notice is one line of text."""
-        simulator = make()
         if supports(simulator, ReportsNotices):
             self._drive(simulator, 1)
             for notice in simulator.notices:
                 assert isinstance(notice, str)
                 assert len(notice.splitlines()) == 1
-        simulator.close()
 
-    def test_what_is_simulated_before_the_first_step_is_the_same_again(self, make: Make) -> None:
+    def test_what_is_simulated_before_the_first_step_is_the_same_again(self, simulator: Simulator) -> None:
         """`CountsSetUp`: the simulator counts the same number of steps after each reset."""
-        simulator = make()
         simulator.reset(seed=1)
         if supports(simulator, CountsSetUp):
             steps = simulator.setup_steps
@@ -341,7 +316,6 @@ class SimulatorContract:
             assert steps >= 0
             self._drive(simulator, 1)
             assert simulator.setup_steps == steps
-        simulator.close()
 
     def test_tidying_changes_no_episode(self, make: Make) -> None:
         """`RestoresState`: restoring the state before the first episode and between two episodes changes no result."""

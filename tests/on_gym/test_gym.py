@@ -91,10 +91,10 @@ class TestGym(SimulatorContract):
         monkeypatch.syspath_prepend(tmp_path)
         return lambda: GymSimulator(scenario_of(name), tmp_path)
 
-    def test_an_episode_depends_on_its_seed_alone(self, make, name):
+    def test_an_episode_depends_on_its_seed_alone(self, simulator, name):
         if name == "FrozenLake-v1":  # it always begins in the same place, and the lake is slippery by chance
             self.steps = 3
-        super().test_an_episode_depends_on_its_seed_alone(make)
+        super().test_an_episode_depends_on_its_seed_alone(simulator)
 
 
 FALL = {"tilt": np.array([1.0, 0.0], np.float32), "kick": 0}

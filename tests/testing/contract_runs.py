@@ -15,7 +15,12 @@ def run_test(suite, name, fixtures):
     method = getattr(suite(), name)
     code = method.__func__.__code__
     wanted = code.co_varnames[1 : code.co_argcount]
-    method(**{key: value for key, value in fixtures.items() if key in wanted})
+    given = {key: value for key, value in fixtures.items() if key in wanted}
+    if "simulator" in wanted:  # as the fixture of the suite does
+        given["simulator"] = fixtures["make"]()
+    method(**given)
+    if "simulator" in wanted:
+        given["simulator"].close()
 
 
 def failing(suite, fixtures):
