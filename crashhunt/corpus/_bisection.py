@@ -102,7 +102,10 @@ def bisect(
             for path in files_outside(values, (inside, scratch)):
                 tell(f"every revision uses the same file: {path} ({name}), which the work tree does not contain")
         case = add_case(bundle, scratch / "corpus").case.path.resolve()
-        revisions = _Revisions(case, inside, tree, modules, build, build_limit_s, watch, tell)
+        revisions = _Revisions(
+            case=case, folder=inside, tree=tree, modules=modules, build=build, build_limit_s=build_limit_s, watch=watch,
+            tell=tell,
+        )  # fmt: skip
         revisions.require("still", bad, "--bad")
         git(tree, "checkout", "--quiet", "--detach", ends[0])
         revisions.require("fixed", good, "--good")

@@ -100,3 +100,14 @@ class HangsUnlessFirst(Fine):
 
     def go_wrong(self):
         raise ValueError("no plan")
+
+
+class Waits(Fine):
+    """Stops before the step that the file ``wait-at`` names, and writes its process into the file ``waits``."""
+
+    def act(self, observation):
+        if Path("wait-at").exists() and Path("wait-at").read_text() == str(self.step):
+            Path("waits.part").write_text(str(os.getpid()))
+            Path("waits.part").rename("waits")
+            time.sleep(1000)
+        return super().act(observation)

@@ -188,7 +188,7 @@ def test_agent_of_an_edited_trial_is_handed_over_or_overruled(process, monkeypat
         def __init__(self, *given):
             self.given = given
 
-    monkeypatch.setattr(_trial_process, "ReferenceDriver", Driver)
+    monkeypatch.setattr(_trial_process, "CompetentDriver", Driver)
     monkeypatch.setattr(_trial_process, "overruled_agent", lambda *given: Driver(*given))
     over, hand = SimpleNamespace(agent="ego"), SimpleNamespace(agent="ego")
     plain = ("ego", "simulator", {"a": 1})
