@@ -43,19 +43,12 @@ _ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys
 
 @dataclass(frozen=True, slots=True)
 class Bisected(Serializable):
-    """The result of a bisection.
+    """The result of a bisection."""
 
-    Args:
-        commit: The first commit with the crash; None if revisions that cannot run make it ambiguous.
-        subject: The subject line of the commit's message.
-        candidates: The commits that may have introduced the crash, if the result is ambiguous.
-        tried: The tried revisions, each with the status of the crash.
-    """
-
-    commit: str | None
-    subject: str
-    candidates: tuple[str, ...]
-    tried: dict[str, Got]
+    commit: str | None  # the first commit with the crash; None if revisions that cannot run make it ambiguous
+    subject: str  # the subject line of the commit's message
+    candidates: tuple[str, ...]  # the commits that may have introduced the crash, if the result is ambiguous
+    tried: dict[str, Got]  # the tried revisions, each with the status of the crash
 
 
 def bisect(

@@ -120,17 +120,11 @@ def with_other_words(
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """The disturbances that an edit by the user selects.
+    """The disturbances that an edit by the user selects."""
 
-    Args:
-        kind: the kind of disturbance, optionally preceded by the agent; empty for every kind.
-        step: the step as the user wrote it.
-        field: the field to change; empty for the whole disturbance.
-    """
-
-    kind: str
-    step: str
-    field: str
+    kind: str  # the kind of disturbance, optionally preceded by the agent; empty for every kind
+    step: str  # the step as the user wrote it
+    field: str  # the field to change; empty for the whole disturbance
 
     @classmethod
     def of(cls, text: str) -> _Asked:
@@ -194,18 +188,13 @@ Values = dict[tuple[str, str], Value]  # (agent, or empty for the scenario; name
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """The differences between a trial and its recording, as text.
+    """The differences between a trial and its recording, as text."""
 
-    Args:
-        agents: differences in the agents and their arguments.
-        others: all other differences, such as traffic, length and crash criteria. Other differences may explain why a
-            crash does not reproduce.
-        ignored: changes in ``hunt.toml`` that have no effect on a replay.
-    """
-
-    agents: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()  # differences in the agents and their arguments
+    # all other differences, such as traffic, length and crash criteria. Other differences may explain why a crash does
+    # not reproduce.
     others: tuple[str, ...] = ()
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # changes in ``hunt.toml`` that have no effect on a replay
 
     @property
     def all(self) -> tuple[str, ...]:

@@ -36,81 +36,53 @@ Code = Literal["snapshot", "current", "log"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """The options of a debugged replay.
+    """The options of a debugged replay."""
 
-    Args:
-        until: number of steps to run.
-        stop_at: the step in which the debugger stops in ``act`` of the crashed agent; 0 for none.
-        to_stderr: whether the output of the process goes to standard error.
-        quiet: whether to hide the output of the process, including the simulator's warnings.
-        panels: the first step whose panels are drawn, and the folder for the pictures.
-        window: wall time between two steps in the simulator's window, in s; the window pauses before the crash. With
-            None, no window opens.
-    """
-
-    until: int
-    stop_at: int = 0
-    to_stderr: bool = False
-    quiet: bool = False
-    panels: tuple[int, Path] | None = None
+    until: int  # number of steps to run
+    stop_at: int = 0  # the step in which the debugger stops in ``act`` of the crashed agent; 0 for none
+    to_stderr: bool = False  # whether the output of the process goes to standard error
+    quiet: bool = False  # whether to hide the output of the process, including the simulator's warnings
+    panels: tuple[int, Path] | None = None  # the first step whose panels are drawn, and the folder for the pictures
+    # wall time between two steps in the simulator's window, in s; the window pauses before the crash. With None, no
+    # window opens.
     window: float | None = None
 
 
 @clear_constructor
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayOptions:
-    """The options of a replay.
+    """The options of a replay."""
 
-    Args:
-        code: what controls the agents: the code of the snapshot, the current code, or the recorded actions.
-        changes: new value of each argument, by ``NAME`` or ``AGENT.NAME``.
-        force: whether to replay from a damaged snapshot.
-        times: number of replays.
-        scenario: name or path of another scenario in which to drive; empty for the scenario of the crash.
-        accelerate: whether simulators are accelerated if the results stay bit-identical.
-        trusted: whether the code of the crash may run; None to determine it. If the code is not trusted, only recorded
-            actions are replayed, and only if the simulator runs no other code.
-        look: what to examine in a process that uses this process's terminal; None to run in the background without the
-            terminal.
-    """
-
+    # what controls the agents: the code of the snapshot, the current code, or the recorded actions
     code: Code = "snapshot"
+    # new value of each argument, by ``NAME`` or ``AGENT.NAME``
     changes: Mapping[str, str] = field(default_factory=dict)
-    force: bool = False
-    times: int = 1
-    scenario: str = ""
-    accelerate: bool = True
+    force: bool = False  # whether to replay from a damaged snapshot
+    times: int = 1  # number of replays
+    scenario: str = ""  # name or path of another scenario in which to drive; empty for the scenario of the crash
+    accelerate: bool = True  # whether simulators are accelerated if the results stay bit-identical
+    # whether the code of the crash may run; None to determine it. If the code is not trusted, only recorded actions are
+    # replayed, and only if the simulator runs no other code.
     trusted: bool | None = None
+    # what to examine in a process that uses this process's terminal; None to run in the background without the terminal
     look: Look | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """A crash that has been prepared for a replay.
+    """A crash that has been prepared for a replay."""
 
-    Args:
-        bundle: bundle of the crash.
-        recorded: the recording of the crash.
-        spec: the trial to run, with all edits.
-        worker: settings of the worker that runs the trial; its scratch folder is not set yet.
-        code: the code that controls the agents, as in `ReplayOptions`.
-        snapshot: snapshot of the bundle.
-        edits: the differences from the recorded trial, as text.
-        warnings: warnings about possible causes of different results, as text.
-        other_traffic: the edits that do not concern the agents; if the crash does not occur, they may be the reason.
-        elsewhere: whether the replay uses another scenario, so that its steps cannot be compared.
-    """
-
-    bundle: Bundle
-    recorded: Recording
-    spec: TrialSpec
-    worker: WorkerSettings
-    code: Code
-    snapshot: Snapshot
-    edits: tuple[str, ...]
-    warnings: tuple[str, ...]
+    bundle: Bundle  # bundle of the crash
+    recorded: Recording  # the recording of the crash
+    spec: TrialSpec  # the trial to run, with all edits
+    worker: WorkerSettings  # settings of the worker that runs the trial; its scratch folder is not set yet
+    code: Code  # the code that controls the agents, as in `ReplayOptions`
+    snapshot: Snapshot  # snapshot of the bundle
+    edits: tuple[str, ...]  # the differences from the recorded trial, as text
+    warnings: tuple[str, ...]  # warnings about possible causes of different results, as text
+    # the edits that do not concern the agents; if the crash does not occur, they may be the reason
     other_traffic: tuple[str, ...] = ()
-    elsewhere: bool = False
+    elsewhere: bool = False  # whether the replay uses another scenario, so that its steps cannot be compared
 
     @property
     def code_differences(self) -> list[str] | None:
