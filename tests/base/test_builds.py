@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from conftest import wait_for
 
 import crashhunt.base.git
 from crashhunt.base.git import BuildError, clean_tree, copy_built, files_outside, run_build, track_built
@@ -57,15 +56,20 @@ def test_long_build_is_announced_once(tmp_path, monkeypatch):
     assert said == ["building HEAD (abc): sleep 0.2"]
 
 
+def is_running(pid):
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())  # which a zombie has empty
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 @pytest.mark.parametrize("why", ["too long", "interrupted"])
 def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch, why):
     wait = subprocess.Popen.wait
 
     def interrupted(process, timeout=None):
         monkeypatch.setattr(subprocess.Popen, "wait", wait)
-        deadline = time.monotonic() + 60
-        while not (tmp_path / "second").exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_for((tmp_path / "second").exists)
         if why == "interrupted":
             raise KeyboardInterrupt
         raise subprocess.TimeoutExpired("sleep", timeout)
@@ -75,15 +79,7 @@ def test_build_that_is_ended_leaves_no_process(tmp_path, temporary, monkeypatch,
     error = KeyboardInterrupt if why == "interrupted" else BuildError
     with pytest.raises(error, match="^$" if why == "interrupted" else "still ran after 9 s: begun"):
         build("echo begun; sleep 600 & echo $! > first; mv first second; wait", tmp_path, limit_s=9)
-    pid = int((tmp_path / "second").read_text())
-    deadline = time.monotonic() + 60
-    while Path(f"/proc/{pid}/cmdline").exists() and time.monotonic() < deadline:
-        if not Path(f"/proc/{pid}/cmdline").read_bytes():  # a zombie
-            break
-        time.sleep(0.01)
-    else:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: not is_running((tmp_path / "second").read_text().strip()))
     assert bool(list(temporary.iterdir())) == (why == "too long")
 
 
@@ -91,15 +87,10 @@ def test_processes_of_a_build_end_with_a_crashhunt_that_is_killed(tmp_path):
     code = "from crashhunt.base.git import run_build as run; from pathlib import Path; run({!r}, Path(), None, {})"
     words = code.format("sleep 600 & echo $! > first; mv first second; wait; true", "limit_s=600.0, name='HEAD'")
     builder = subprocess.Popen([sys.executable, "-c", words], cwd=tmp_path)
-    deadline = time.monotonic() + 60
-    while not (tmp_path / "second").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for((tmp_path / "second").exists)
     builder.kill()
     builder.wait()
-    pid = (tmp_path / "second").read_text().strip()
-    while Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for(lambda: not is_running((tmp_path / "second").read_text().strip()))
 
 
 def git(folder, *words):
