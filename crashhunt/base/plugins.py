@@ -8,6 +8,7 @@ import pkgutil
 import re
 import sys
 import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import metadata
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.agent_locators import factory_of, is_program
+from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import HuntWhileImportingError, PluginError
 from crashhunt.base.exceptions import INSTALLED_FOLDERS, in_words, place_of
 from crashhunt.base.extras import install_command
@@ -23,7 +25,7 @@ from crashhunt.base.text import did_you_mean, one_of
 
 if TYPE_CHECKING:
     import types
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator
     from importlib.machinery import ModuleSpec
     from importlib.metadata import Distribution, EntryPoint
 
@@ -112,11 +114,11 @@ def is_foreign_module(name: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class ImportedModules:
+class ImportedModules(Serializable):
     """The modules that a process has imported, whose files a snapshot contains."""
 
     # file of each top-level module, and its folders if it is a package
-    places: Mapping[str, tuple[str | None, tuple[str, ...]]]
+    places: Mapping[str, tuple[str | None, Sequence[str]]]
     path: tuple[str, ...] = ()  # the folders from which modules are imported
     named: frozenset[str] = frozenset()  # the top-level modules that were imported explicitly by name
     agents: tuple[str, ...] = ()  # the files of the modules that contain agents
@@ -149,22 +151,6 @@ class ImportedModules:
             places=places, path=tuple(sys.path), named=frozenset(name.partition(".")[0] for name in named),
             agents=tuple(file for file in agents if file), variables=dict(os.environ),
         )  # fmt: skip
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> ImportedModules:
-        """Return the modules that `to_json` has described."""
-        places = {name: (file, tuple(folders)) for name, (file, folders) in data["places"].items()}
-        return cls(
-            places, tuple(data["path"]), frozenset(data["named"]), tuple(data["agents"]), data["variables"],
-            tuple(data["read"]),
-        )  # fmt: skip
-
-    def to_json(self) -> dict[str, object]:
-        """Return a description of the modules as JSON-compatible data."""
-        return {
-            "places": dict(self.places), "path": self.path, "named": sorted(self.named), "agents": self.agents,
-            "variables": dict(self.variables), "read": self.read,
-        }  # fmt: skip
 
 
 def load_object(target: str, *, shown: str = "", installed: bool = False) -> Any:
