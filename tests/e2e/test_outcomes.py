@@ -87,7 +87,7 @@ def test_an_agent_that_does_not_start_is_refused_at_once(toy):
     """It once was so many trials that could not be set up."""
     done = toy.crashhunt("run", "h", "1", "500", "100", "--agent", "faulty:FailsToStart", *TOY, "--json", expect=2)
     assert done.json["error"]["message"] == "faulty:FailsToStart does not start: RuntimeError: no weights"
-    assert done.json["error"]["where"] == "faulty.py:81"
+    assert done.json["error"]["where"] == "faulty.py:82"
     (hunt,) = toy.crashhunt("status", "h", "--json").json["hunts"]
     assert (hunt["state"], hunt["trials_run"], hunt["crashes"]) == ("error", 0, 0)
     assert "no weights" in hunt["detail"]
