@@ -252,7 +252,7 @@ class RunningHunt:
         self.has_begun = False  # whether the ledger says that the hunt runs, with all facts of `progress`
         self._sampler = sampler_of(settings)
         self.disturber = disturber_apart(setup.scenario, settings)
-        self.progress = Progress(notes=setup.notes)
+        self.progress = Progress(notes=[*setup.notes])
         self.finished = ledger.finished()
         self._record_saved_crashes()
         self.unanswered = Unanswered(ledger)
@@ -666,7 +666,8 @@ class TrialLoop:
             if note not in (known := ledger.facts().get("notices") or []):
                 ledger.note(notices=[*known, note])
         if occurred := self._notices.newly_occurred():
-            progress.notes[:] = [note for note in progress.notes if not note.startswith(occurred)]
+            for note in [note for note in progress.notes if note.startswith(occurred)]:
+                progress.notes.remove(note)  # each by itself: the thread of the confirmation may add one meanwhile
             known = ledger.facts().get("notices") or []
             ledger.note(notices=[note for note in known if not note.startswith(occurred)] or None)
         progress.look_at(self._executor)
