@@ -9,6 +9,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crashhunt.base import layout
 from crashhunt.base.errors import FULL, HuntDirectoryError
 from crashhunt.base.temporary import remove_tree, temporary_beside, temporary_name
 
@@ -49,6 +50,21 @@ def whole_file(path: Path, *, lasting: bool = True, noted: bool = True) -> Itera
             raise cannot_write(path, error) from error
         finally:
             remove_tree(temporary)
+
+
+@contextmanager
+def output_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary name as `whole_file` does, for a file that the user names.
+
+    Raises:
+        HuntDirectoryError: the file cannot be written, or would replace a file of a hunt, a crash or a scenario.
+    """
+    if path.name in layout.KEPT and path.is_file():
+        raise HuntDirectoryError(
+            "would replace a file of a hunt, a crash or a scenario", fix="give another file", where=str(path)
+        )
+    with whole_file(path) as temporary:
+        yield temporary
 
 
 def _refuse_device(path: Path) -> None:

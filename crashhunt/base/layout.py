@@ -77,6 +77,14 @@ BUILDING: Final = ".building-"
 REPLACED: Final = ".replaced-"
 """What stands in the name of a hunt that another one has taken the place of."""
 
+KEPT: Final = frozenset(
+    (
+        HUNT, LEDGER, REQUEST, NOTES, CRASH, PARAMS, LOG, RUN_LOG, ERROR_LOG, FOXGLOVE_LAYOUT, LIGHTS,
+        CASE, MANIFEST, ENVIRONMENT, GIT_DIFF, SCENARIO, TRAINED_ON,
+    )
+)  # fmt: skip
+"""Files that no output replaces that the user names."""
+
 
 def crash_folder(number: int, outcome: str) -> str:
     """Return the name of a crash's folder, which is the id of the crash, such as ``000012-collision``."""

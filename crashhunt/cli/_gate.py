@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import format_number
 from crashhunt.cli._common import (
     DONE,
@@ -154,7 +154,7 @@ def _gate(options: Options, words: list[str]) -> int:
     say(describe_gate(found), as_json=options.json)
     summary = gate_summary(found)
     if options.markdown is not None:
-        with whole_file(options.markdown) as temporary:
+        with output_file(options.markdown) as temporary:
             temporary.write_text(f"{summary}\n", encoding="utf-8")
     if options.junit is not None:
         write_gate_junit(found, options.junit)

@@ -38,7 +38,7 @@ def add_trials(commands: Commands) -> None:
 
 
 def _trials(options: Options, _words: list[str]) -> int:
-    from crashhunt.base.files import whole_file
+    from crashhunt.base.files import output_file
     from crashhunt.crashes import read_notes
     from crashhunt.report import describe_note
     from crashhunt.results import HuntResults, write_parquet, write_text
@@ -68,7 +68,7 @@ def _trials(options: Options, _words: list[str]) -> int:
     if options.format == "parquet":
         count = write_parquet(hunt, options.out, outcomes=outcomes)
     else:
-        with whole_file(options.out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        with output_file(options.out) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             count = write_text(hunt, file, options.format, outcomes=outcomes)
     print(f"{command_line(options.out)} has {count} trials", file=sys.stderr)
     return 0

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.integrity import FILES, FileEntry, digest_of_content, parse_object, too_large, typed, user_key
 from crashhunt.base.progress import Watch, watched
 from crashhunt.base.temporary import temporary_folder
@@ -78,7 +78,7 @@ def export_crash(bundle: Bundle, target: Path, *, watch: Watch | None = None) ->
     files += [snapshot.path / name for name in snapshot.manifest["files"]]
     files += sorted(path for path in snapshot.path.iterdir() if path.is_file())
     entries: dict[str, FileEntry] = {}
-    with whole_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+    with output_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in watched(files, len(files), watch):
             if path.is_file() and not path.is_symlink():
                 name = path.relative_to(hunt).as_posix()

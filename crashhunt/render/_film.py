@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.extras import install_command
-from crashhunt.base.files import cannot_write, whole_file
+from crashhunt.base.files import cannot_write, output_file
 from crashhunt.base.progress import Watch, watched
 from crashhunt.base.temporary import temporary_beside
 from crashhunt.crashes import Encounter, danger_course
@@ -202,7 +202,7 @@ def write_video(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watc
     import av
 
     count = 0
-    with whole_file(path) as temporary, av.open(str(temporary), "w") as container:
+    with output_file(path) as temporary, av.open(str(temporary), "w") as container:
         stream: Any = None
         for picture in watched(frames(shots, options), _count(shots, options), watch):
             if stream is None:
@@ -227,7 +227,7 @@ def write_gif(path: Path, shots: Sequence[Shot], options: FilmOptions, *, watch:
         Image.fromarray(picture).quantize(64)
         for picture in watched(frames(shots, options), _count(shots, options), watch)
     ]
-    with whole_file(path) as temporary:
+    with output_file(path) as temporary:
         pictures[0].save(
             temporary,
             save_all=True,

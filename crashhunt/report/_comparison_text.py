@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import aligned, count_of, format_number, in_lines
 from crashhunt.report._argument_words import argument_units
 from crashhunt.report._rate_text import count_training_trials
@@ -121,7 +121,7 @@ def comparison_page(found: Comparison, path: Path) -> None:
         f'<h2>Outcomes</h2><div class="wide">{_outcomes(found.hunts)}</div>'
         f'<h2>Crash rate against each argument</h2><div class="plots">{plots}</div></body></html>\n'
     )
-    with whole_file(path) as temporary:
+    with output_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 

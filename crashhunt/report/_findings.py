@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import command_line, count_of, one_line
 from crashhunt.base.version import __version__
 from crashhunt.crashes import own_frames
@@ -278,7 +278,7 @@ def write_sarif(findings: Sequence[CrashFinding], target: Path) -> None:
         "version": "2.1.0",
         "runs": [{"tool": {"driver": driver}, "columnKind": "unicodeCodePoints", "results": results}],
     }
-    with whole_file(target) as temporary:
+    with output_file(target) as temporary:
         temporary.write_text(json.dumps(found, indent=1), encoding="utf-8")
 
 

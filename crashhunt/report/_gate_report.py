@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import command_line, count_of, format_number, in_lines, visible
 from crashhunt.report._findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
@@ -254,5 +254,5 @@ def write_gate_junit(found: GateReport, path: Path) -> None:
     root = Xml.Element("testsuites")
     root.append(suite)
     Xml.indent(root)
-    with whole_file(path) as temporary:
+    with output_file(path) as temporary:
         Xml.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypedDict
 import numpy as np
 
 from crashhunt.base import layout
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.progress import Watch, watched
 from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, read_notes, signature_of
@@ -216,7 +216,7 @@ def write_report(
     page = page.replace("/*NUMBERS*/\n", player.numbers).replace("/*PLAYER*/\n", player.script)
     # Inside a script element, only "</" and "<!--" mean something to HTML.
     text = page.replace("/*DATA*/", json.dumps(data, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c"))
-    with whole_file(target) as temporary:
+    with output_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return target.stat().st_size
 

@@ -8,7 +8,7 @@ import math
 from itertools import groupby
 from typing import TYPE_CHECKING, TextIO
 
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import count_of, format_number, in_lines
 from crashhunt.statistics import PER_WORDS, Interval
 
@@ -226,7 +226,7 @@ def rates_page(rates: Sequence[CrashRate], path: Path) -> None:
         f'<p class="faint">At least and at most: {confidence} % confidence, valid whenever you look.</p>'
         f'<div class="wide"><table><tr>{head}</tr>{body}</table></div></body></html>\n'
     )
-    with whole_file(path) as temporary:
+    with output_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ from crashhunt.base import layout
 from crashhunt.base.calls import clear_calls
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.extras import install_command
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.temporary import temporary_beside, temporary_folder, temporary_name
 from crashhunt.base.text import count_of, one_of, out_of
 from crashhunt.crashes import (
@@ -353,7 +353,7 @@ def write_parquet(hunt: HuntResults, path: Path, *, outcomes: Sequence[str] = ()
     kinds = _kinds(hunt, list(islice(hunt.rows(outcomes=outcomes), _MAX_INSPECTED_ROWS)))
     schema = {name: getattr(pl, kind) for name, kind in kinds.items()}
     with (
-        whole_file(path) as temporary,
+        output_file(path) as temporary,
         temporary_beside(path, name=temporary_name(path, ".csv")) as plain,
         plain.open("w", encoding="utf-8", newline="") as table,
     ):
