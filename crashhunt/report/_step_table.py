@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.json_types import finite
 from crashhunt.base.text import aligned, did_you_mean
 from crashhunt.crashes import Encounter
 from crashhunt.recording import describe_value, is_opaque
@@ -101,7 +102,7 @@ def steps_table(recording: Recording, fields: Sequence[str], agent: str, other: 
                 row[name] = None if array is None else _item(array, observed[name], channel.observation_shape)
             else:
                 row[name] = _of_scene(step, agent, name)
-        rows.append({name: None if _is_nothing(value) else value for name, value in row.items()})
+        rows.append({name: finite(value) if isinstance(value, float) else value for name, value in row.items()})
     return rows
 
 
@@ -175,10 +176,6 @@ def _of_scene(step: StepRecord, agent: str, name: str) -> float | None:
     scene = step.scene
     row = scene.roster.index.get(agent) if scene is not None else None
     return None if scene is None or row is None else float(scene.data[row, _SCENE_FIELDS.index(name)])
-
-
-def _is_nothing(value: TableCell) -> bool:
-    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _format(value: TableCell) -> str:

@@ -81,7 +81,8 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
     names = imported.named | _not_installed(places)
     _take_module("crashhunt", imported, found)
     # A replay never reads the pages of the guide.
-    found.files = {place: file for place, file in found.files.items() if not _is_page(place)}
+    pages = f"{layout.CODE}/crashhunt/guide/"
+    found.files = {at: file for at, file in found.files.items() if not (at.startswith(pages) and at.endswith(".md"))}
     work_tree_of = cache(_work_tree_of)  # a project has many modules in one folder, and git takes milliseconds
     for name in sorted(names - {"crashhunt"}):
         place = places.get(name)
@@ -159,10 +160,6 @@ def _archive_of(file: str) -> Path | None:
     if not file or os.path.exists(file):  # noqa: PTH110 - of hundreds of modules
         return None
     return next((path for path in Path(file).parents if path.is_file()), None)
-
-
-def _is_page(place: str) -> bool:
-    return place.startswith(f"{layout.CODE}/crashhunt/guide/") and place.endswith(".md")
 
 
 def _walk(folder: Path) -> Iterator[str]:
