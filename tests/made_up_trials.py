@@ -52,11 +52,13 @@ def replace_bundles(monkeypatch):
     """Replace bundles: each is confirmed, and has the result of its trial; returns the numbers of their trials."""
     written = []
 
-    def write(folder, result, trial, *, hunt_seed, snapshot, lanes):
+    def write(folder, result, trial, *, hunt_seed, snapshot, lanes, recording):
         written.append(result.spec.number)
         return SimpleNamespace(result=result, id=f"{result.spec.number:06d}", confirmed=True, path=folder)
 
     monkeypatch.setattr(_hunt, "write_bundle", write)
+    monkeypatch.setattr(_hunt, "read_black_box", lambda path: [])
+    monkeypatch.setattr(_hunt, "Recording", lambda records: None)
     monkeypatch.setattr(_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
     return written
 

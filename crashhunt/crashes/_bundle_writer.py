@@ -61,6 +61,7 @@ def write_bundle(
     place: str = layout.CRASHES,
     confirmed: bool | None = None,
     authenticate: bool = True,
+    recording: Recording | None = None,
 ) -> Bundle:
     """Write the bundle of a crash or near miss from the files that its trial left in its scratch folder.
 
@@ -76,12 +77,13 @@ def write_bundle(
         confirmed: whether a replay in a new process was bit-identical; None if unknown.
         authenticate: whether to add the code that proves that this user made the bundle; only if the snapshot is from
             this user.
+        recording: recording of the trial; None to read it from the scratch folder.
     """
     from crashhunt.recording import foxglove_layout, write_log
 
     name = name or layout.crash_folder(result.spec.number, result.outcome)
     final = directory / place / name
-    recording = Recording(read_black_box(scratch / layout.BLACK_BOX))
+    recording = recording or Recording(read_black_box(scratch / layout.BLACK_BOX))
     crash = result if result.outcome.category != "no crash" else None
     metadata = {"trial": str(result.spec.number), "seed": str(result.spec.seed), "outcome": str(result.outcome)}
     view = json.dumps(foxglove_layout(recording), indent=1)

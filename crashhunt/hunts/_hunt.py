@@ -42,6 +42,7 @@ from crashhunt.hunts._reports import HuntReport, StoppedBecause
 from crashhunt.hunts._verification import Confirmation, TrialReruns, VerificationRuns, is_settled, keep_near_misses
 from crashhunt.ledger import Ledger
 from crashhunt.plans import core_of, disturber_apart, sampler_of
+from crashhunt.recording import Recording, read_black_box
 from crashhunt.results import (
     HEARTBEAT_S,
     HuntDirectory,
@@ -640,6 +641,7 @@ class TrialLoop:
         """Save a crash: first the bundle, then the row, so that every crash in the ledger has a bundle."""
         setup = self._hunt.setup
         trial = scratch_of(setup.place.scratch, result.spec.number)
+        recording = Recording(read_black_box(trial / layout.BLACK_BOX))  # a log would take much longer to read
         bundle = write_bundle(
             setup.place.path,
             result,
@@ -647,8 +649,9 @@ class TrialLoop:
             hunt_seed=setup.settings.seed,
             snapshot=setup.snapshot.digest,
             lanes=read_map(setup.place.scratch, trial),
+            recording=recording,
         )
-        self._hunt.progress.save(bundle)
+        self._hunt.progress.save(bundle, recording)
         self._ledger.record(result, snapshot=setup.snapshot.digest)
 
     def _cancel_above(self, wanted: int) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crashhunt.executors import Executor, NodeFigures
     from crashhunt.ledger import Facts, Ledger, Noted, RunningRate
     from crashhunt.plans import RunSettings
-    from crashhunt.recording import BlackBoxHeader
+    from crashhunt.recording import BlackBoxHeader, Recording
     from crashhunt.statistics import BarWatch, RareWatch, RateWatch
     from crashhunt.trial import TrialResult
 
@@ -282,12 +282,12 @@ class Progress:
             self.stressed = result if result.stress.least < least else self.stressed
         self.not_fully_asked += not result.is_fully_asked
 
-    def save(self, bundle: Bundle) -> None:
-        """Add a crash that has been saved."""
+    def save(self, bundle: Bundle, recording: Recording | None = None) -> None:
+        """Add a crash that has been saved; its recording is read from the log if it is not given."""
         self.crashes.append(bundle)
         self.tally.add(bundle.result)
         if self.kinds is not None:
-            self.kinds.add(bundle, self.ended_here + 1)  # counted after its row is written
+            self.kinds.add(bundle, self.ended_here + 1, recording)  # counted after its row is written
 
     def replace(self, crashes: list[Bundle]) -> None:
         """Replace the crashes by their confirmed versions."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from crashhunt.base.codec import JsonObject
     from crashhunt.crashes import Bundle, Cause, Signature
     from crashhunt.ledger import Facts, Noted
+    from crashhunt.recording import Recording
     from crashhunt.trial import TrialResult
 
 _MAX_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
@@ -288,9 +289,9 @@ class Kinds:
             for word, answer in self.dropped_judged.get(str(signature), {}).items():
                 self._count(int(word), signature, division.restore(int(word), answer))
 
-    def add(self, bundle: Bundle, ended: int) -> None:
-        """Add a saved crash."""
-        if self._add_signature(bundle):
+    def add(self, bundle: Bundle, ended: int, recording: Recording | None = None) -> None:
+        """Add a saved crash; its recording is read from the log if it is not given."""
+        if self._add_signature(bundle, recording):
             self.newest, self.newest_trial = time.time(), ended
 
     def groups(self, *, running: bool = False) -> tuple[Group, ...]:
@@ -448,13 +449,14 @@ class Kinds:
                 self._signed[number] = self._signed[number][0], bundle
         self._groups = None
 
-    def _add_signature(self, bundle: Bundle) -> bool:
+    def _add_signature(self, bundle: Bundle, recording: Recording | None = None) -> bool:
         """Add a crash; return whether its crash type is new."""
         number = bundle.result.spec.number
         collided = bundle.result.collision is not None
         try:
             # All look at it, and reading a log takes longer than looking.
-            recording = bundle.recording() if collided and (self._only_at_fault or self._by_cause) else None
+            if recording is None and collided and (self._only_at_fault or self._by_cause):
+                recording = bundle.recording()
             signature = signature_of(bundle, recording)
             if self._only_at_fault and fault_of(bundle, recording).is_egos:
                 self._at_fault.add(number)

@@ -400,7 +400,7 @@ def test_hunt_that_keeps_going_reports_its_shortest_crash_first(run, bundles, mo
         until=None, added=[], types_by_cause=None, at_fault=(2, 4), newest=None, newest_trial=None,
         groups=lambda **_: (), refresh=lambda crashes: None, next_to_judge=lambda: None, count_to_judge=lambda: 0,
     )  # fmt: skip
-    kinds.add = lambda bundle, ended: kinds.added.append((bundle.result.spec.number, ended))
+    kinds.add = lambda bundle, ended, recording: kinds.added.append((bundle.result.spec.number, ended))
     monkeypatch.setattr("crashhunt.hunts._progress.Kinds", lambda *_, **__: kinds)
 
     def ends(spec):

@@ -250,7 +250,7 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
     running.trials = SimpleNamespace(ended=lambda given: calls.append(("ended", given.spec.number)))
     running.progress = SimpleNamespace(
         kinds=object(), count=lambda given, *, crashed, planned: calls.append(("counted", crashed, planned)),
-        save=lambda bundle: calls.append(("saved", bundle)),
+        save=lambda *given: calls.append(("saved", *given)),
     )  # fmt: skip
     found = loop()
     monkeypatch.setattr(_hunt, "write_trial", lambda _, given, scratch: calls.append(("files", scratch.name)))
@@ -261,6 +261,8 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
         return "bundle"
 
     monkeypatch.setattr(_hunt, "write_bundle", write)
+    monkeypatch.setattr(_hunt, "read_black_box", lambda path: path.parent.name)
+    monkeypatch.setattr(_hunt, "Recording", "recording of {}".format)
 
     def record(given):
         calls.clear()
@@ -272,10 +274,10 @@ def test_trial_is_written_recorded_and_counted(running, loop, monkeypatch):
     assert record(result(6, Outcome.INVALID)) == [("row", 6, "0f"), ("counted", False, 9), ("ended", 6)]
     assert record(result(99)) == [("ended", 99)]
     crash = result(7, Outcome.COLLISION)
-    more = {"hunt_seed": 3, "snapshot": "0f", "lanes": "lanes"}
+    more = {"hunt_seed": 3, "snapshot": "0f", "lanes": "lanes", "recording": "recording of trial-000007"}
     assert record(crash) == [
-        ("bundle", True, "trial-000007", more), ("saved", "bundle"), ("row", 7, "0f"), ("counted", True, 9),
-        ("ended", 7),
+        ("bundle", True, "trial-000007", more), ("saved", "bundle", more["recording"]), ("row", 7, "0f"),
+        ("counted", True, 9), ("ended", 7),
     ]  # fmt: skip
     running.progress.kinds = None  # it is saved once it is the one that ends the hunt
     assert record(crash) == [("counted", True, 9), ("ended", 7)]

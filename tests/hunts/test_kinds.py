@@ -161,6 +161,17 @@ def one_type(monkeypatch):
     monkeypatch.setattr(_crashes, "features_of", lambda bundle, _: (float(bundle.result.spec.number),))
 
 
+def test_log_is_not_read_where_the_recording_is_at_hand(monkeypatch):
+    used = []
+    found = {"signature_of": "type", "features_of": (0.0,), "fault_of": SimpleNamespace(is_egos=True)}
+    for name, answer in found.items():
+        monkeypatch.setattr(_crashes, name, lambda _, given, answer=answer: used.append(given) or answer)
+    bundle = collision(3)
+    bundle.recording = lambda: pytest.fail("reads the log")
+    Kinds(1, only_at_fault=True, by_cause=3).add(bundle, 1, "recording")
+    assert used == ["recording"] * 3
+
+
 def settle(kinds, bundle, what, **more):
     kinds.settle(Judged(bundle, Cause("omission", what) if what else None, **more))
 

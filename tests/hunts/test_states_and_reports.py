@@ -181,10 +181,10 @@ def saved(number):
 def test_new_type_is_of_the_trial_that_is_counted_after_its_row(monkeypatch):
     progress, added = Progress(), []
     progress.resume([], RunSettings(keep_going=True), {})
-    monkeypatch.setattr(progress.kinds, "add", lambda bundle, ended: added.append(ended))
+    monkeypatch.setattr(progress.kinds, "add", lambda bundle, *given: added.append(given))
     progress.count(result(0), crashed=False, planned=9)
-    progress.save(saved(1))
-    assert added == [2]
+    progress.save(saved(1), "recording")
+    assert added == [(2, "recording")]
 
 
 def test_what_the_ledger_is_to_know_now_is_noted():
