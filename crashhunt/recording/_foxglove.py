@@ -206,7 +206,8 @@ def _shifted(shape: NDArray[np.float64], distance: float) -> NDArray[np.float64]
 def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene], crash: TrialResult | None) -> None:
     # Making a message is dear, changing one is cheap: each actor has one that is changed and serialised in every
     # step. A SceneUpdate is then put together from these; on the wire it is nothing but its parts in a row.
-    boxes: dict[Actor, SceneEntity] = {}
+    boxes: dict[Actor, _Box] = {}
+    roster, present = None, list[_Box]()
     transforms = FrameTransforms()
     children = {
         agent: transforms.transforms.add(parent_frame_id="map", child_frame_id=agent) for agent in recording.agents
@@ -218,29 +219,33 @@ def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene],
         time_ns = to_ns(scene.time_s)
         seconds, nanos = divmod(time_ns, 1_000_000_000)
         centers = scene.centers.tolist()
-        parts = []
-        for row, actor in enumerate(scene.roster.actors):
-            box = boxes.get(actor)
-            if box is None:
-                box = boxes[actor] = _box(actor, recording.agents, parties, lifetime_ns)
-            (x, y), half = centers[row], scene.headings[row] / 2
+        if scene.roster is not roster:
+            roster = scene.roster
+            for actor in roster.actors:
+                if actor not in boxes:
+                    boxes[actor] = _Box(_entity(actor, recording.agents, parties, lifetime_ns))
+            present = [boxes[actor] for actor in roster.actors]
+        parts: list[bytes] = []
+        for row, (box, (x, y), heading) in enumerate(zip(present, centers, scene.headings, strict=True)):
+            half = heading / 2
             z = scene.heights[row] if scene.heights else 0.0
             turn_z, turn_w = math.sin(half), math.cos(half)
-            if scene.spines or len(box.cubes) > 1:
-                _bend(box, scene, row)
+            entity, position, orientation, timestamp = box.entity, box.position, box.orientation, box.timestamp
+            if scene.spines or len(entity.cubes) > 1:
+                _bend(entity, scene, row)
             else:
-                place = box.cubes[0].pose
-                place.position.x, place.position.y, place.position.z = x, y, z + box.cubes[0].size.z / 2
-                place.orientation.z, place.orientation.w = turn_z, turn_w
-            box.timestamp.seconds, box.timestamp.nanos = seconds, nanos
-            data = box.SerializeToString()
-            parts.append(b"\x12" + _varint(len(data)) + data)  # field 2, entities
-            child = children.get(actor.id)
+                position.x, position.y, position.z = x, y, z + box.half_height
+                orientation.z, orientation.w = turn_z, turn_w
+            timestamp.seconds, timestamp.nanos = seconds, nanos
+            data = entity.SerializeToString()
+            size = len(data)
+            parts += (b"\x12", _VARINTS[size] if size < len(_VARINTS) else _varint(size), data)  # field 2, entities
+            child = children.get(entity.id)
             if child is not None:
                 child.timestamp.seconds, child.timestamp.nanos = seconds, nanos
                 child.translation.x, child.translation.y, child.translation.z = x, y, z
                 child.rotation.z, child.rotation.w = turn_z, turn_w
-                if actor.id == recording.agents[0]:
+                if entity.id == recording.agents[0]:
                     pose.timestamp.seconds, pose.timestamp.nanos = seconds, nanos
                     pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = x, y, z
                     pose.pose.orientation.z, pose.pose.orientation.w = turn_z, turn_w
@@ -249,7 +254,18 @@ def _write_scenes(log: LogWriter, recording: Recording, scenes: Sequence[Scene],
         log.write("/ego/pose", PoseInFrame, pose.SerializeToString(), time_ns)
 
 
-def _box(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> SceneEntity:
+class _Box:
+    """The entity of an actor, and the parts of it that change in every step; each access makes a new object."""
+
+    __slots__ = ("entity", "half_height", "orientation", "position", "timestamp")
+
+    def __init__(self, entity: SceneEntity) -> None:
+        cube = entity.cubes[0]
+        self.entity, self.timestamp, self.half_height = entity, entity.timestamp, cube.size.z / 2
+        self.position, self.orientation = cube.pose.position, cube.pose.orientation
+
+
+def _entity(actor: Actor, agents: Sequence[str], parties: Sequence[str], lifetime_ns: int) -> SceneEntity:
     role = (
         "ego"
         if actor.id == agents[0]
@@ -344,6 +360,9 @@ def _varint(value: int) -> bytes:
         value >>= 7
     out.append(value)
     return bytes(out)
+
+
+_VARINTS = tuple(map(_varint, range(1024)))
 
 
 # Topics and protobuf messages of an MCAP file, at simulation time; the file itself is written in `_log`.
