@@ -86,6 +86,9 @@ def find_bundle(directory: Path, crash: str = "") -> Bundle:
                 f"{str(directory)!r} is a file, not the directory of a hunt",
                 fix="unpack it into a new folder if crashhunt export wrote it, and give that folder",
             )
+        if directory.exists() and not directory.is_dir():  # such as a shell's <(command)
+            message = f"{str(directory)!r} is a device or a pipe, which cannot be read twice"
+            raise BundleError(message, fix="write its contents to a file, and give that file")
         if not directory.is_dir():
             fix = f"{near_path(directory, '.zip', with_file=(layout.HUNT, layout.CRASH))}give the directory of a hunt"
             raise BundleError(f"{str(directory)!r} does not exist", fix=fix)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import shutil
 import threading
 from typing import TYPE_CHECKING
@@ -343,6 +344,9 @@ def test_a_crash_is_found_by_what_people_call_it(tmp_path):
     with pytest.raises(BundleError, match="no crash was saved here") as caught:
         find_bundle(tmp_path / "kept")
     assert caught.value.fix.endswith(f": {tmp_path}/kept/base, {tmp_path}/kept/head")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BundleError, match=r"pipe' is a device or a pipe, .*; write its contents to a file"):
+        find_bundle(tmp_path / "pipe")
     with pytest.raises(BundleError, match="does not exist"):
         find_bundle(tmp_path / "gone", "1")
 
