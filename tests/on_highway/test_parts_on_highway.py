@@ -296,6 +296,29 @@ def on(road, start, end, s, kind=IDMVehicle):
     return made
 
 
+def test_lanes_ahead_end_at_a_fork_without_a_route():
+    road = crossing()
+    vehicle = on(road, "w", "c", 50.0)
+    ahead = lambda index=None: [lane[:2] for lane in _disturbances.lanes_ahead(road.network, vehicle, index)]  # noqa: E731
+    assert ahead() == [("w", "c")]
+    vehicle.route = [("w", "c", 0), ("c", "n", 0)]
+    assert ahead() == [("w", "c"), ("c", "n")]
+    vehicle.route = [("w", "c", 0), ("c", "nowhere", 0)]
+    assert ahead() == [("w", "c")]
+    assert ahead(("c", "e", 0)) == [("c", "e")]
+    plain = on(road, "w", "c", 50.0, kind=Vehicle)
+    assert [lane[:2] for lane in _disturbances.lanes_ahead(road.network, plain)] == [("w", "c")]
+    network = RoadNetwork()
+    for number in range(3):
+        network.add_lane("a", "b", StraightLane([0, 4 * number], [50, 4 * number]))
+    for number in range(2):
+        network.add_lane("b", "a", StraightLane([50, 4 * number], [0, 4 * number]))
+    road = Road(network, np_random=np.random.default_rng(1))
+    round_trip = IDMVehicle(road, [10.0, 8.0], 0.0, 10.0)
+    round_trip.lane_index = ("a", "b", 2)
+    assert list(_disturbances.lanes_ahead(network, round_trip)) == [("a", "b", 2), ("b", "a", 1)]
+
+
 @pytest.mark.parametrize(
     ("one", "two", "route", "crossed"),
     [
@@ -312,6 +335,22 @@ def test_paths_cross_within_their_reach(one, two, route, crossed):
     agent.route = [("w", "c", 0), ("c", route, 0)]
     assert _disturbances.crosses(road.network, agent, other) is crossed
     assert _disturbances.crosses(road.network, other, agent) is crossed
+
+
+def test_path_of_a_vehicle_has_a_point_every_2_m_for_80_m():
+    road = straight()
+    vehicle = put(road, 101.0, 1)
+    roads, points = _disturbances._way(road.network, vehicle)
+    assert roads == {("0", "1")}
+    assert points[:, 0].tolist() == [101.0, *range(101, 181, 2)]
+    assert set(points[:, 1]) == {4.0}
+    road = crossing()
+    turning = on(road, "w", "c", 97.0)
+    turning.route = [("w", "c", 0), ("c", "n", 0)]
+    roads, points = _disturbances._way(road.network, turning)
+    assert roads == {("w", "c"), ("c", "n")}
+    assert points[:5].tolist() == [[-3.0, 0.0], [-3.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]
+    assert points[-1].tolist() == [0.0, 48.0]  # the end of the road
 
 
 def test_crossing_vehicle_is_the_nearest_on_a_road_with_rules():

@@ -59,6 +59,14 @@ def test_vehicle_brakes_to_its_target_and_keeps_it_where_that_is_safe(sumo):
     ]  # fmt: skip
 
 
+def test_desired_speed_is_raised_by_a_share_and_put_back(sumo):
+    made = _disturbances._Speeds("other", 0.5)
+    assert made.how_strong == 0.5
+    assert commanded(sumo, made, {"vehicle_getSpeedFactor": 9.0}) == [
+        [("setSpeedFactor", "other", 1.875)], [], [("setSpeedFactor", "other", 1.25)]
+    ]  # fmt: skip
+
+
 def test_vehicle_cuts_in_and_brakes_in_the_new_lane_only(sumo):
     made = _disturbances._CutsIn("other", "e_2", 3.0, 0.5, 4.0)
     assert made.how_strong == 3.0
@@ -70,6 +78,34 @@ def test_vehicle_cuts_in_and_brakes_in_the_new_lane_only(sumo):
     ]  # fmt: skip
     plain = _disturbances._CutsIn("other", "e_2", 0.0, 0.5, 4.0)
     assert commanded(sumo, plain, {"vehicle_getLaneID": "e_2"})[1:] == [[], [("setLaneChangeMode", "other", 1621)]]
+
+
+def test_vehicle_merges_when_little_is_left_of_its_lane(sumo):
+    made = _disturbances._MergesLate("other", 2, 100.0, 30.0)
+    assert made.how_strong == 30.0
+    change = [("setLaneChangeMode", "other", 256), ("changeLane", "other", 2, 3600.0)]
+    end = [("setLaneChangeMode", "other", 1621), ("changeLane", "other", 1, 0.0)]
+    found = commanded(sumo, made, {}, {"vehicle_getLanePosition": 69.9}, {"vehicle_getLanePosition": 70.0}, {})
+    assert found == [[("setLaneChangeMode", "other", 0)], [], [], change, [], end]
+    sumo.answers["vehicle_getLanePosition"] = 0.0
+    left = _disturbances._MergesLate("other", 2, 100.0, 30.0)
+    assert commanded(sumo, left, {}, {"vehicle_getRoadID": "f"})[1:] == [[], [("setLaneChangeMode", "other", 256)], end]
+    sumo.answers["vehicle_getRoadID"] = "e"
+    waits = _disturbances._MergesLate("other", 2, 100.0, 30.0)
+    assert commanded(sumo, waits, {})[1:] == [[], [("setLaneChangeMode", "other", 1621)]]
+
+
+def test_vehicle_that_ignores_priority_is_commanded_a_speed_that_it_can_reach(sumo):
+    made = _disturbances._Ignores("other", 0.5)
+    assert made.how_strong == 1.0
+    found = commanded(
+        sumo, made, {"vehicle_getAllowedSpeed": 10.5}, {"vehicle_getAllowedSpeed": 5.0},
+        {"vehicle_getSpeed": 1.0, "vehicle_getAllowedSpeed": 0.0}, {"vehicle_getAllowedSpeed": -3.0},
+    )  # fmt: skip
+    speeds = [found[0][1][2], *(step[0][2] for step in found[1:-1])]
+    assert speeds == [11.0, 10.5, 8.0, 0.0, 0.0]
+    assert found[0][0] == ("setSpeedMode", "other", 7)
+    assert found[-1] == [("setSpeedMode", "other", 31), ("setSpeed", "other", -1.0)]
 
 
 @pytest.mark.parametrize(
@@ -248,6 +284,28 @@ def test_person_walks_straight_to_the_agents_axis(person, sumo, turn, side):
     assert (way.angle - (90.0 - turn + side * 90.0)) % 360.0 == pytest.approx(0.0, abs=1e-9) or (
         way.angle - (90.0 - turn + side * 90.0)
     ) % 360.0 == pytest.approx(360.0)
+
+
+def test_person_steps_out_stands_and_is_back_in_time(person, sumo):
+    speeds = {}
+    made = SteppingOut("person p", "ego", [9.0] * 13, 1.0, speeds)
+    assert made.how_strong == 1.5  # as fast as it can
+    moved, shown = [], [speeds["p"]]
+    for _ in range(12):
+        moved += sumo.taken()
+        made.keep()
+        shown.append(speeds["p"])
+    moved += sumo.taken()
+    assert {call[:3] for call in moved} == {("moveToXY", "p", "")}
+    assert [(x, round(y, 9)) for *_, x, y, _, _, _ in moved] == [
+        (30.0, y) for y in (-4.5, -3.0, -1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.5, -3.0, -4.5, -6.0)
+    ]
+    assert shown == [1.5] * 4 + [0.0] * 5 + [1.5] * 4
+    assert [call[5] for call in moved] == pytest.approx([0.0] * 9 + [180.0] * 4)
+    assert {call[6:] for call in moved} == {(2, 100.0)}
+    made.end()
+    assert person.calls == [("append", "p", ("s", "t"), 12.0), ("remove", "p", 0)]
+    assert speeds == {}
 
 
 def test_person_that_has_too_little_time_turns_back_before_the_axis(person, sumo):
