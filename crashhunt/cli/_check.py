@@ -67,11 +67,13 @@ def _describe(found: Checked) -> str:
     parts += [count_of(minimized, "minimized crash")] if minimized else []
     parts += [count_of(near, "near miss")] if near else []
     listed = " and ".join(", ".join(parts).rsplit(", ", 1))
-    lines = [f"{command_line(found.dir)}: {listed} {'are' if found.kind == 'hunt' else 'is'} intact"]
+    lines = [
+        f"{command_line(found.dir)}: {listed} {'is' if parts[0].startswith('1 ') and len(parts) == 1 else 'are'} intact"
+    ]
     if not found.fine:
         bad = [
-            f"{len(numbers)} {name}"
-            for numbers, name in ((found.damaged_trials, "trials"), (found.damaged_crashes, "crashes"))
+            count_of(len(numbers), noun)
+            for numbers, noun in ((found.damaged_trials, "trial"), (found.damaged_crashes, "crash"))
             if numbers
         ]
         lines[0] += f"; damaged: {', '.join(bad) or 'see below'}"

@@ -736,11 +736,12 @@ def test_check_names_what_is_intact_damaged_and_lost():
     near = checked(near_misses=["000002-survived", "000003-survived"])
     assert _check._describe(near) == "h: 2 trials, 1 crash and 2 near misses are intact"
     assert _check._describe(checked(kind="crash")) == "h: 1 crash is intact"
+    assert _check._describe(checked(kind="crash", crash_count=0)) == "h: 0 crashes are intact"
     alone = checked(kind="crash", crash_count=0, near_misses=["000002-survived"])
     assert _check._describe(alone) == "h: 1 near miss is intact"
     damaged = checked(fine=False, damaged_trials=[3, 4], damaged_crashes=[5], findings=(finding, note))
     assert _check._describe(damaged).splitlines() == [
-        "h: 2 trials and 1 crash are intact; damaged: 2 trials, 1 crashes",
+        "h: 2 trials and 1 crash are intact; damaged: 2 trials, 1 crash",
         "  damaged: ledger.sqlite: cut off",
         "    lost: trial 3",
         "    salvage it",
