@@ -71,6 +71,19 @@ def test_a_lane_that_it_has_left_is_still_known_but_not_on_a_road_of_another_num
     assert changes(agent, left) == [0] * 10
 
 
+def test_its_speed_follows_the_model_between_braking_with_8_and_accelerating_with_2_5():
+    agent = LaneChanger(desired_speed=22.0, step_length_s=0.1)
+    for shown, leader in (
+        (seen(15.0, {"x": 45, "vx": -2}), Leader(40.0, 2.0)),
+        (seen(15.0), None),
+        (seen(15.0, {"x": 7, "vx": -10}), Leader(2.0, 10.0)),
+    ):
+        wanted = idm_acceleration(15.0, leader, desired_speed=22.0, headway_s=1.2)
+        assert agent.act(shown)[0] == pytest.approx(15.0 + 0.1 * max(-8.0, wanted), abs=1e-4)
+    assert agent.act(seen(0.3, {"x": 6, "vx": 0}))[0] == 0.0
+    assert LaneChanger(desired_speed=22.0).act(seen(0.0))[0] <= 0.25
+
+
 def driver(**more):
     return IntelligentDriver(**{"desired_speed": 25.0, "patience_s": 1.0, "step_length_s": 0.5, **more})
 
