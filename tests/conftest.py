@@ -71,9 +71,18 @@ def _write_to_memory() -> None:
         return
     fits = found.f_bavail * found.f_frsize > _ROOM and os.access(place, os.W_OK)
     if "TMPDIR" not in os.environ and fits and not found.f_flag & os.ST_NOEXEC:  # some tests run what they write
-        os.environ["TMPDIR"] = folder = tempfile.mkdtemp(prefix="tests-", dir=place)
+        _remove_older(Path(place))
+        os.environ["TMPDIR"] = folder = tempfile.mkdtemp(prefix=f"{_SESSION}{os.getpid()}-", dir=place)
         tempfile.tempdir = None
         atexit.register(_tidy, Path(folder), os.getpid())
+
+
+def _remove_older(place: Path) -> None:
+    """Remove what killed and failed sessions have left, but for the three newest, as pytest does with its folders."""
+    with contextlib.suppress(OSError):  # another session has removed one meanwhile
+        for folder in sorted(place.glob(f"{_SESSION}*"), key=os.path.getmtime)[:-3]:
+            if not Path("/proc", folder.name.split("-")[2]).exists():
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _tidy(folder: Path, pid: int) -> None:
@@ -87,6 +96,7 @@ def _tidy(folder: Path, pid: int) -> None:
 
 
 _ROOM = 4 << 30  # bytes; a session needs a tenth of it
+_SESSION = f"tests-{os.getuid()}-"  # and the process of the session: the beginning of its folder's name
 _write_to_memory()
 
 # In the background of a shell, or under nohup, these are ignored, and so they would be by what tests start and stop.
