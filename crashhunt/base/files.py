@@ -57,14 +57,19 @@ def output_file(path: Path) -> Iterator[Path]:
     """Yield a temporary name as `whole_file` does, for a file that the user names.
 
     Raises:
-        HuntDirectoryError: the file cannot be written, or would replace a file of a hunt, a crash or a scenario.
+        HuntDirectoryError: the file cannot be written, or would change a file of a hunt, a crash or a scenario.
     """
-    if path.name in layout.KEPT and path.is_file():
-        raise HuntDirectoryError(
-            "would replace a file of a hunt, a crash or a scenario", fix="give another file", where=str(path)
-        )
+    refuse_kept(path)
     with whole_file(path) as temporary:
         yield temporary
+
+
+def refuse_kept(path: Path) -> None:
+    """Raise an error if an output would replace, or be added to, a file of a hunt, a crash or a scenario."""
+    if path.name in layout.KEPT and path.is_file():
+        raise HuntDirectoryError(
+            "would change a file of a hunt, a crash or a scenario", fix="give another file", where=str(path)
+        )
 
 
 def _refuse_device(path: Path) -> None:

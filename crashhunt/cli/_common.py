@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 from crashhunt.base import layout
 from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import FULL, CrashhuntError, HuntDirectoryError, UsageError
-from crashhunt.base.files import cannot_write
+from crashhunt.base.files import cannot_write, refuse_kept
 from crashhunt.base.integrity import MAX_INTEGER
 from crashhunt.base.older_versions import removed_fix
 from crashhunt.base.text import command_line, did_you_mean, one_of, visible
@@ -452,6 +452,7 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
         HuntDirectoryError: the summary file cannot be written.
     """
     if options.summary is not None:
+        refuse_kept(options.summary)
         try:
             with options.summary.open("a", encoding="utf-8") as file:
                 file.write(f"{summary}\n")

@@ -7,7 +7,7 @@ from decimal import Decimal
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.text import one_line
 
 if TYPE_CHECKING:
@@ -43,5 +43,5 @@ def write_xml(root: ET.Element, target: Path) -> None:
         HuntDirectoryError: the file cannot be written.
     """
     ET.indent(root)
-    with whole_file(target) as temporary:
+    with output_file(target) as temporary:
         ET.ElementTree(root).write(temporary, encoding="UTF-8", xml_declaration=True)

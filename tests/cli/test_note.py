@@ -62,17 +62,18 @@ def test_crash_outside_its_hunt_has_no_report_and_no_notes(hunt):
     assert not list((hunt.folder / "sent").glob("*.*"))
 
 
-def test_no_output_replaces_a_file_of_a_hunt(hunt):
+def test_no_output_changes_a_file_of_a_hunt(hunt):
     ledger = (hunt.folder / "out" / layout.LEDGER).read_bytes()
     for words in (
         ("export", "out"),
         ("report", "out", "--output"),
         ("trials", "out", "--out"),
         ("rate", "out", "--html"),
+        ("crashes", "out", "--summary"),
     ):
         refused = hunt.crashhunt(*words, "out/ledger.sqlite", expect=2)
         assert refused.err.splitlines()[-1] == (
-            "crashhunt: out/ledger.sqlite: would replace a file of a hunt, a crash or a scenario; give another file"
+            "crashhunt: out/ledger.sqlite: would change a file of a hunt, a crash or a scenario; give another file"
         )
     assert (hunt.folder / "out" / layout.LEDGER).read_bytes() == ledger
 
