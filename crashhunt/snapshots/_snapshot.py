@@ -89,6 +89,9 @@ class Snapshot:
             message, fix = error.args
             raise BundleError(message, fix=fix, where=str(file)) from None
         except (OSError, ValueError) as error:
+            if not self.path.exists():  # such as for a crash that was copied outside its hunt
+                fix = "copy the whole directory of the hunt, or write the crash into a file with crashhunt export"
+                raise BundleError("the snapshot is missing", fix=fix, where=str(self.path)) from None
             reason = error.strerror if isinstance(error, OSError) else error
             raise BundleError(
                 f"the snapshot has no manifest: {reason}", fix=_DAMAGE_FIX, where=str(self.path)

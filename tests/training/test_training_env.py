@@ -264,7 +264,7 @@ def test_a_crash_without_its_snapshot_is_refused(crashes, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(crashes, copy)
     shutil.rmtree(copy / "snapshots")
-    assert "the snapshot has no manifest" in refused(copy)
+    assert "the snapshot is missing; copy the whole directory of the hunt, or write the crash" in refused(copy)
 
 
 def test_step_before_a_reset_is_reported(env):
