@@ -86,7 +86,8 @@ def _trust_place(place: Path) -> list[TrustedOrigin]:
         with open_archive(place) as archive:
             return trust_hunt(archive.directory, place)
     if not place.is_dir():
-        raise BundleError(f"{str(place)!r} does not exist", fix=f"{near_path(place, '.zip')}give a folder or a file")
+        what = "is a device or a pipe" if place.exists() else "does not exist"
+        raise BundleError(f"{str(place)!r} {what}", fix=f"{near_path(place, '.zip')}give a folder or a file")
     if not any((place / name).exists() for name in (layout.CRASH, layout.HUNT)) and place.resolve() == work_tree(place):
         return [trust_repository(place.resolve())]
     hunts: set[Path] = set()

@@ -172,9 +172,9 @@ def find_cases(places: list[Path]) -> list[Path]:
         files = place.rglob(layout.CASE)
         inside = sorted(file.parent for file in files if not _is_hidden(file.parent.relative_to(place)))
         if not inside:
-            what = "is a file, not a folder" if place.is_file() else "does not exist"
+            what = "is not a folder" if place.exists() else "does not exist"
             what = "has no case of a corpus" if place.is_dir() else what
-            fix = "" if place.is_dir() else near_path(place)
+            fix = "" if place.exists() else near_path(place)
             raise BundleError(
                 f"{str(place)!r} {what}", fix=f"{fix}add a case with crashhunt corpus add BUNDLE --to FOLDER"
             )

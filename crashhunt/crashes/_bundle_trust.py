@@ -264,10 +264,10 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
     changed = ""
     try:
         settings = read_settings(bundle.hunt / layout.HUNT)
-        runs = describe_code(snapshot, settings)
+        runs = f": {describe_code(snapshot, settings)}"
         changed = _first_change(settings, snapshot)
     except CrashhuntError as error:
-        runs = f"what cannot be described: {error.message}"
+        runs = f", which cannot be described: {error.message}"
     if changed:  # trust in the code as it was taken is no trust in the code as it is now
         proof, fix = changed, "get an undamaged copy, or add --trust if you trust that code as it is now"
         if made_by:
@@ -285,7 +285,7 @@ def refuse_untrusted(bundle: Bundle, *, where: str = "", made_by: str = "") -> U
     else:
         proof = "nothing proves that you made it on this machine"
     return UntrustedError(
-        f"{proof}, and this would run its code: {runs}",
+        f"{proof}, and this would run its code{runs}",
         fix=f"{fix}; crashhunt replay --from-log runs none of it",
         where=place,
     )

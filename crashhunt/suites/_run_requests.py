@@ -87,14 +87,14 @@ def refuse_untrusted_hunt(hunt: Path) -> None:
         return
     try:
         if snapshot is not None:
-            runs = describe_code(snapshot, read_settings(hunt / layout.HUNT))
+            runs = f"of {describe_code(snapshot, read_settings(hunt / layout.HUNT))}"
         else:
             request = RunRequest.read(hunt / REQUEST)
-            runs = f"{', '.join(request.request.locators.values()) or 'its agents'}, imported from {request.folder}"
+            runs = f"of {', '.join(request.request.locators.values()) or 'its agents'}, imported from {request.folder}"
     except CrashhuntError as error:
-        runs = f"what cannot be described: {error.message}"
+        runs = f"that cannot be described ({error.message})"
     raise UntrustedError(
-        f"nothing proves that you began this hunt on this machine, and running it again would run code: {runs}",
+        f"nothing proves that you began this hunt on this machine, and running it again would run code {runs}",
         fix=f"if you trust that code, run {command_line('crashhunt', 'trust', hunt)} once, or add --trust",
         where=str(hunt),
     )

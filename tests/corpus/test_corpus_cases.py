@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import threading
 import time
@@ -139,6 +140,9 @@ def test_cases_are_found_at_any_depth_and_not_in_hidden_folders(case, tmp_path):
         find_cases([tmp_path / "kep"])
     assert caught.value.message == f"'{tmp_path / 'kep'}' does not exist"
     assert "kept" in caught.value.fix.partition("add one")[0]
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(BundleError, match=r"pipe' is not a folder; add a case"):
+        find_cases([tmp_path / "pipe"])
 
 
 def test_case_of_a_corpus_is_copied_whole_and_only_once(case, tmp_path):

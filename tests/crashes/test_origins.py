@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -417,8 +418,10 @@ def test_command_lists_and_removes(place, capsys):
         fingerprints = {one["fingerprint"] for one in json.loads(out)["trusted"]}
         assert entry["fingerprint"] in fingerprints, named
         crashhunt(*(word for fingerprint in fingerprints for word in ("--remove", fingerprint)))
+    os.mkfifo(place / "pipe")
     for words, says in (
         ((place / "thiers",), "does not exist"),
+        ((place / "pipe",), "is a device or a pipe"),
         ((place / "toy",), "has no code that could run"),
         ((place / "theirs", "--remove", "x"), "cannot be combined"),
         (("--remove", "x"), "no trusted origin has this name"),
@@ -429,3 +432,6 @@ def test_command_lists_and_removes(place, capsys):
     code, _, err = crashhunt(place / "theirs")
     assert (code, "has changed" in err) == (2, True)
     assert list_trusted() == []
+    crash = crash_of(place / "theirs")
+    (place / "theirs" / "hunt.toml").unlink()
+    assert "would run its code, which cannot be described: " in refuse_untrusted(crash).message
