@@ -396,7 +396,7 @@ def run_scorecard(
     """
     entries = list(entries_of(groups_of(suite, groups), agent, speeds, grid=grid, options=options or {}))
     made = Suite([entry for _, entry in entries])
-    states = made.run(directory, parallel, watch=watch, trusted=trusted)
+    states = made.run(directory, parallel, watch=watch, trusted=trusted, stop_on_error=True)
     for state in states:
         if state.state == "error":
             raise HuntDirectoryError(

@@ -174,8 +174,9 @@ class Suite:
         watch: Callable[[list[HuntState]], None] | None = None,
         machine: Given | None = None,
         trusted: bool = False,
+        stop_on_error: bool = False,
     ) -> list[HuntState]:
-        """Run all unfinished hunts, even if some fail; return the state of each hunt.
+        """Run all unfinished hunts; return the state of each hunt.
 
         Args:
             directory: directory of the suite; created if it does not exist. Finished hunts in the directory stay
@@ -185,6 +186,7 @@ class Suite:
             machine: execution options, such as ``executor``, that replace the options of all hunts.
             trusted: whether the code that existing hunts name may run; otherwise every hunt must be trusted before the
                 first hunt starts.
+            stop_on_error: whether the other hunts stop when one could not run. By default, they run.
 
         Raises:
             UntrustedError: an existing hunt was not made on this machine and is not trusted.
@@ -196,11 +198,19 @@ class Suite:
         waiting = [folder for folder in folders if hunt_state(folder).state in ("queued", "interrupted", "killed")]
         for folder in () if trusted else waiting:
             refuse_untrusted_hunt(folder)
+        states: list[HuntState] = []
+
+        def look() -> None:
+            states[:] = [hunt_state(folder) for folder in folders]
+            if watch is not None:
+                watch(states)
+
         run_all(
             waiting,
             parallel,
-            watch=None if watch is None else lambda: watch([hunt_state(f) for f in folders]),
+            watch=look,
             machine=machine,
+            is_enough=lambda: stop_on_error and any(state.state == "error" for state in states),
         )
         return [hunt_state(folder) for folder in folders]
 

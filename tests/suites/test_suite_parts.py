@@ -339,18 +339,18 @@ def test_hunts_of_a_suite_run_until_they_have_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(_suite, "hunt_state", lambda folder: SimpleNamespace(state=states[int(folder.name)]))
     monkeypatch.setattr(_suite, "refuse_untrusted_hunt", checked.append)
 
-    def run(folders, parallel, *, watch, machine):
-        ran.append(([folder.name for folder in folders], parallel, machine))
-        if watch:
-            watch()
+    def run(folders, parallel, *, watch, machine, is_enough):
+        watch()
+        ran.append(([folder.name for folder in folders], parallel, machine, is_enough()))
 
     monkeypatch.setattr(_suite, "run_all", run)
     result = found.run(tmp_path / "out", 3, watch=seen.append, machine={"executor": "fresh"})
     assert [one.state for one in result] == [one.state for one in seen[0]] == states
-    assert ran == [(["0", "1", "2"], 3, {"executor": "fresh"})]
+    assert ran == [(["0", "1", "2"], 3, {"executor": "fresh"}, False)]
     assert [folder.name for folder in checked] == ["0", "1", "2"]
-    found.run(tmp_path / "out", trusted=True)
+    found.run(tmp_path / "out", trusted=True, stop_on_error=True)
     assert len(checked) == 3
+    assert ran[-1][-1]  # as one hunt could not run
 
 
 def test_finished_hunts_that_a_suite_does_not_run_again_are_reported_with_changed_files(tmp_path, monkeypatch):
