@@ -18,3 +18,6 @@ from crashhunt.trial._call_signature import (
     CallSignature as CallSignature,
     signature_of as signature_of,
 )
+
+Signature = CallSignature
+"""The name of `CallSignature` in earlier versions."""

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.errors import ArgumentError
-from crashhunt.space import Choice, Constant, Range, parse_spec
+from crashhunt.space import Choice, Constant, Range, Signature, parse_spec
 from crashhunt.trial._argument_space import Argument, kind_of
 from crashhunt.trial._call_signature import CallSignature, signature_of
 
@@ -352,7 +352,7 @@ def test_annotations_of_a_wrapped_function_are_those_of_its_own_module():
 def test_signature_is_rebuilt_from_its_data():
     found = signature_of(Follower)
     data = json.loads(json.dumps(found.to_json()))
-    assert CallSignature.from_json(data) == found
+    assert CallSignature.from_json(data) == Signature.from_json(data) == found
     assert data["arguments"][0] == {
         "name": "speed", "kind": "float", "default": 7.0, "unit": "m/s", "help": "its speed",
         "distribution": "5.0:9.0",
