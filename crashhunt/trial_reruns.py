@@ -105,7 +105,7 @@ class EndedRun:
     """A run that has ended, with its recording."""
 
     place: int  # index of the run's specification among the specifications of the call
-    result: TrialResult  # result of the trial
+    result: TrialResult
     # recording of the trial; None if it was not requested, or if the process died before it could record
     recording: Recording | None
     folder: Path  # folder with the files of the trial; it exists until the next run is requested

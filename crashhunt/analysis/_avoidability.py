@@ -90,6 +90,12 @@ class AvoidanceSearch:
 
     The search bisects. After the bisection, the search runs the manoeuvre from steps after the last step that avoided
     the crash. The reason is that a later step may avoid the crash even if an earlier step does not.
+
+    Args:
+        end: number of the step of the crash.
+        start: the step at which the search begins.
+        run: runs a manoeuvre after each of some steps and yields the results; it may raise `CannotError`.
+        runs: maximum number of runs, of which ``parallel`` run at a time.
     """
 
     def __init__(

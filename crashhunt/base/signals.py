@@ -62,6 +62,8 @@ def is_interrupt(error: BaseException | None) -> bool:
 def interrupted_after(seconds: float) -> Iterator[None]:
     """Return a context whose code is interrupted by an `InterruptedCodeError` if it does not end in time.
 
+    The code is interrupted again each second, because it may catch the interruption.
+
     In a thread that is not the main thread, signal handlers cannot be set, so the code is not interrupted.
 
     Raises:

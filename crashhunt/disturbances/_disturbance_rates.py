@@ -296,7 +296,7 @@ class DisturbanceSampler:
     models: Mapping[str, DisturbanceModel]  # models by name
     rates: Mapping[str, float]  # rate of each model, in 1/s, by name
     agents: tuple[str, ...]  # the controlled vehicles, around which disturbances occur
-    step_length_s: float  # step length in s
+    step_length_s: float
     fixed: tuple[Disturbance, ...] = ()  # disturbances that every trial has in addition to the drawn ones
 
     def draw(self, seed: int, max_steps: int) -> tuple[Disturbance, ...]:

@@ -265,7 +265,7 @@ class DisturbanceInjector:
 
 
 class _Late:
-    """Delays a value: returns the value of an earlier step; before that, a value derived from the first value."""
+    """Delays a value by ``delay`` steps; before that, returns a value derived from the first value."""
 
     def __init__(self, delay: int, held: Callable[[Array], Array] = lambda first: first) -> None:
         self._delay = delay

@@ -64,7 +64,7 @@ class LostTrialError(Exception):
 class EndedTrial:
     """A trial that has ended."""
 
-    result: TrialResult  # result of the trial
+    result: TrialResult
     notices: tuple[str, ...] = ()  # texts for the user
     # how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request it
     braking: Mapping[str, object] | None = None

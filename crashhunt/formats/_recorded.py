@@ -87,7 +87,7 @@ class RecordedCrash:
 
     title: str  # description of the crash, in one line
     number: int  # number of the crash's trial
-    step_length_s: float  # step length in s
+    step_length_s: float
     steps: int  # number of recorded steps
     agents: tuple[RecordedPath, ...]  # paths of the controlled vehicles
     others: tuple[RecordedPath, ...]  # the paths of all other actors

@@ -37,7 +37,7 @@ class HuntSetup:
 
     place: HuntDirectory  # directory of the hunt, which is locked
     scenario: Scenario  # scenario of the trials
-    settings: HuntSettings  # settings of the hunt
+    settings: HuntSettings
     workers: WorkerSettings  # settings of the processes that run its trials
     snapshot: Snapshot  # snapshot of the code that runs
     code: CodeVersions  # the versions of the code of all its trials

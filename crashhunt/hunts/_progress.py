@@ -504,7 +504,7 @@ class RemainingTime:
 class PhaseStatus(Serializable):
     """Progress of a phase of a hunt."""
 
-    name: PhaseName  # name of the phase
+    name: PhaseName
     done: int  # number of finished runs
     total: int  # total number of runs
     seconds_left: float | None  # time until the phase ends, in s; None if it is unknown

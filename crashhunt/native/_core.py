@@ -189,7 +189,11 @@ class UsualSteps(Protocol):
         self, tape: object, offset: int, reserved: int, tags: tuple[int, int, int, int, int, int], roster: object,
         numbers: bytes, /,
     ) -> None:  # fmt: skip
-        """Record into a given buffer."""
+        """Record into a buffer from an offset on, up to a number of reserved bytes.
+
+        The tags are those of observation, action, step, lanes, roster and actors. The roster has the actors in sight
+        and must have been recorded; ``numbers`` is the payload of its record.
+        """
 
     def give_back(self) -> tuple[int, int, Any, list[tuple[Any, bytes]]]:
         """Stop recording; return the end of the records, the last complete step, the last roster, and all steps.

@@ -186,7 +186,10 @@ class BlackBox:
         return self._roster
 
     def lend(self, steps: UsualSteps, roster: Roster, numbers: bytes) -> None:
-        """Let the core record the steps of one agent until another method of this black box is called."""
+        """Let the core record the steps of one agent until another method of this black box is called.
+
+        The roster of the first of these steps must have been recorded; ``numbers`` is the payload of its record.
+        """
         self._stop_core()
         self._roster = roster
         steps.borrow(self._map, self._offset, self._reserved, _CORE_TAGS, roster, numbers)

@@ -38,9 +38,9 @@ class AgentChannel(Serializable):
 
     id: str  # identifier of the agent, which is also the identifier of its vehicle
     observation_dtype: str  # type of the observations in NumPy's notation, such as ``<f4``
-    observation_shape: tuple[int, ...]  # shape of one observation
+    observation_shape: tuple[int, ...]
     action_dtype: str  # type of the actions in NumPy's notation, such as ``<i8``
-    action_shape: tuple[int, ...]  # shape of one action
+    action_shape: tuple[int, ...]
     action_names: tuple[str, ...] = ()  # names of the elements of an action
     observation_names: tuple[str, ...] = ()  # names of the columns of an observation
     # the parts of an observation, in their order in the recorded array; empty if the observation has no parts

@@ -70,7 +70,7 @@ class Shot:
     lanes: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]  # lanes of the crash's map
     agent: str  # identifier of the vehicle in the centre of the picture
     other: str  # identifier of the collision partner
-    crash_step: int  # the step of the crash
+    crash_step: int
     panels: Mapping[int, Mapping[str, NDArray[np.uint8]]]  # pictures of the agent's own panels, by step and label
     meanings: Sequence[str] = ()  # names of the agent's discrete actions, if they are known
     # for a near miss, the step around which the film is made; -1 for a crash, with which the film ends

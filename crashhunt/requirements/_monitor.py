@@ -120,7 +120,7 @@ def _pointwise_parts(formula: Formula, *, positive: bool) -> list[tuple[Formula,
 
 
 class _Part:
-    """A part of the formula without temporal operators, and its truth at each sample."""
+    """A part of the formula without temporal operators, and its truth at each sample; `favourable` never violates."""
 
     __slots__ = ("favourable", "formula", "holds", "truths")
 

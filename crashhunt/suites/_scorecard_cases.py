@@ -240,8 +240,8 @@ class Share:
 class ScorecardHunt:
     """The cases of one hunt: which ran, how they ended, and how the models end."""
 
-    group: CaseGroup  # the group of the cases
-    state: HuntState  # state of the hunt
+    group: CaseGroup
+    state: HuntState
     axes: Mapping[str, tuple[Value, ...]]  # the values of each argument that varies, in the order of the names
     constants: Mapping[str, Value]  # the other arguments of the scenario
     ran: Mapping[int, bool]  # for each case that ran, whether the agent crashed, by the index of the case

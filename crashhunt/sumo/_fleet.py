@@ -27,7 +27,8 @@ _STAYS_IN_LANE = 0  # lane change mode
 class Fleet:
     """Vehicles in SUMO, each alone on a straight road.
 
-    Use a fleet as a context, and only one at a time, because libsumo has one simulation.
+    Use a fleet as a context, and only one at a time, because libsumo has one simulation. The vehicles begin with their
+    ``speeds``, in m/s.
     """
 
     def __init__(self, speeds: Values, *, length_m: float, step_s: float) -> None:
@@ -77,7 +78,7 @@ class Fleet:
         libsumo.close()
 
     def drive(self, accelerations: Values) -> Values:
-        """Simulate one step; return the way that each vehicle has driven in the step, in m."""
+        """Simulate one step with accelerations in m/s²; return the way that each vehicle has driven in it, in m."""
         wanted = np.maximum(self.speeds + accelerations * self._step_s, 0.0)
         for place in np.flatnonzero(wanted != self._commanded).tolist():  # SUMO keeps the last command
             sumo.vehicle_setSpeed(self._names[place], float(wanted[place]))

@@ -62,8 +62,8 @@ class LanePaths:
         self,
         graph: LaneGraph,
         sampling: Sampling,
-        ahead: Callable[[GraphLane], Iterable[GraphLane]],
-        behind: Callable[[GraphLane], Iterable[GraphLane]],
+        ahead: Callable[[GraphLane], Iterable[GraphLane]],  # a lane, then those that follow it
+        behind: Callable[[GraphLane], Iterable[GraphLane]],  # those before a lane, the nearest first
     ) -> None:
         self._graph, self._sampling = graph, sampling
         self._ahead, self._behind = ahead, behind

@@ -25,7 +25,7 @@ _COLOURS, _OFF = "gyro", 3  # by the state of the part ``signals``
 
 
 class LightReader:
-    """Reads lights and routes in an episode, from its first step on."""
+    """Reads lights and routes in an episode; ``starts`` are the odometers of agents' vehicles at its start, in m."""
 
     def __init__(self, scenario: Scenario, starts: Mapping[str, float]) -> None:
         agents = {name: replace(setup, observation=(_ROUTE, *_PARTS)) for name, setup in scenario.agents.items()}

@@ -40,7 +40,7 @@ class ReaderSetup:
     graph: LaneGraph  # The lanes of the network. One object is shared by all readers of the simulator, in all episodes.
     conflicts: Conflicts  # the conflicts at the junctions, shared like the lanes
     places: Places  # Finds the vehicle on the network. One object is shared by all readers of the agent.
-    step_length_s: float  # length of a step, in s
+    step_length_s: float
     start_m: float  # the vehicle's odometer (`vehicle.getDistance`) at the start of the episode, in m
     start_s: float  # simulation time at the start of the episode, in s
     # Function that returns the steering angle of the vehicle, in rad, positive to the left. None if the vehicle's
@@ -93,7 +93,7 @@ class NetworkPlace(NamedTuple):
 
     lane: GraphLane  # its lane, or its last lane if it is off every lane
     position_m: float  # distance of the front bumper from the start of the lane, in m, as SUMO measures it
-    guide: RouteGuide  # its route
+    guide: RouteGuide
     number: int  # index of the lane's edge on the route; of the edge before, inside a junction; -1 off the route
     x: float  # x of the centre of the vehicle, in m
     y: float  # y of the centre of the vehicle, in m

@@ -52,7 +52,7 @@ class Vehicles(Protocol):
         """Remove the vehicles."""
 
     def drive(self, accelerations: Values) -> Values:
-        """Simulate one step; return the way that each vehicle has driven in the step, in m."""
+        """Simulate one step with accelerations in m/s²; return the way that each vehicle has driven in it, in m."""
 
 
 class KinematicVehicles:

@@ -105,7 +105,7 @@ class RightOfWay:
     """The paths across all junctions of a map, and which path must yield to which."""
 
     links: tuple[Link, ...]
-    gives_way: frozenset[tuple[int, int]]
+    gives_way: frozenset[tuple[int, int]]  # indices of links: the first must yield to the second
 
     def places(self, lanes: tuple[str, ...], x: float, y: float) -> tuple[int, ...]:
         """Return the indices of the links on which an actor may be, or which it may just have left.

@@ -186,7 +186,7 @@ def core_of(frames: Sequence[Frame]) -> Core | None:
 
 
 def part_of(frame: Frame, agent: str, numbers: list[int] | None = None) -> Part:
-    """Return a frame around an agent in the form that the compiled core needs."""
+    """Return a frame around an agent in the form that the core needs; ``numbers`` of actors are their rows if None."""
     roster = frame.roster
     sizes = (roster.lengths, roster.widths) if roster.vehicles is None else (roster.vehicles, None)
     return frame.columns, roster.index.get(agent, -1), *sizes, numbers
