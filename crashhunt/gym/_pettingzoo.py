@@ -111,6 +111,10 @@ class OneLearner(gymnasium.Env[Any, Any]):
         over = truth_of(ended.get(learner, True), f"terminations[{learner!r}]", _FIX)
         is_cut = truth_of(cut.get(learner, False), f"truncations[{learner!r}]", _FIX)
         gone = not over and not is_cut and learner not in self._parallel.agents
+        if not (over or is_cut or gone):
+            for part, name in ((self._seen, "observation"), (rewards, "reward")):
+                if learner not in part:
+                    raise TypeError(f"step() returned no {name} of the learner {learner!r}, which is among the agents")
         shown = self._seen.get(learner, before)
         info = dict(self._infos.get(learner, {}))
         return shown, rewards.get(learner, 0.0), over or gone, is_cut, info

@@ -182,6 +182,8 @@ def test_learner_that_comes_later_makes_the_trial_invalid(tmp_path):
         (0, 3, "step() returned observations = 3, which is not a dictionary by agent"),
         (2, False, "step() returned terminations = False, which is not a dictionary by agent"),
         (4, [], "step() returned infos = [], which is not a dictionary by agent"),
+        (0, {}, "step() returned no observation of the learner 'runner', which is among the agents"),
+        (1, {}, "step() returned no reward of the learner 'runner', which is among the agents"),
         (4, {"runner": {"caught": {"hunter_0": False}}}, "info['caught'] is of type dict: {'hunter_0': False}"),
     ],
 )
