@@ -53,6 +53,15 @@ def test_a_row_has_what_ranks_it_next_to_its_text(ledger, path):
     assert list(ledger.table()) == [(3, 21, "collision", 4, None)]
 
 
+def test_the_nearest_miss_is_the_least_of_both_ways_to_survive(ledger):
+    assert ledger.nearest_miss() is None
+    survived, finished = Outcome.SURVIVED, Outcome.FINISHED
+    cases = (survived, 2.5, 0), (Outcome.COLLISION, 0.0, 0), (finished, 2.0, 2), (survived, 2.0, 2), (survived, 1.9, 4)
+    for number, (outcome, ttc, nearest) in enumerate(cases):
+        ledger.record(result(number, outcome, ttc=ttc), snapshot="")
+        assert ledger.nearest_miss().spec.number == nearest
+
+
 def test_endings_are_in_the_order_of_trials_and_name_what_was_killed(ledger):
     killed = replace(result(0, Outcome.INVALID), failure=Failure(KILLED, "out of memory"))
     random = replace(result(1), spec=replace(result(1).spec, origin="random"))
