@@ -38,8 +38,8 @@ from crashhunt.results import HuntDirectory, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario
 from crashhunt.statistics import GateCase, GateReport, PairedHunts, PairWatch, check_confidence, measure_rates
 from crashhunt.suites._gate_corpus import run_corpus
+from crashhunt.suites._gate_preventable_crashes import PreventableCrashes
 from crashhunt.suites._gate_versions import GateVersion, WorkTrees
-from crashhunt.suites._preventable_crashes import PreventableCrashes
 from crashhunt.suites._processes import run_all, slots_of
 from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
 from crashhunt.training import held_out_traffics

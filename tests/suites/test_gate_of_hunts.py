@@ -14,7 +14,7 @@ from crashhunt.ledger import Ledger
 from crashhunt.plans import HuntSettings, Request, write_settings
 from crashhunt.report import describe_gate
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_runs as _gate
-from crashhunt.suites._preventable_crashes import PreventableCrashes
+from crashhunt.suites._gate_preventable_crashes import PreventableCrashes
 from crashhunt.trial import Failure, Outcome, TrialResult, TrialSpec
 
 SEED = 4

@@ -11,7 +11,7 @@ import pytest
 
 from crashhunt.errors import HuntDirectoryError, SimulatorError, UsageError
 from crashhunt.training import CrashEnv, TrainedOn, _crash_env
-from crashhunt.training._crash_env import CrashReplay
+from crashhunt.training._crash_priorities import CrashReplay
 from crashhunt.training._held_out_traffics import is_test_traffic, read_trained_on
 
 

@@ -28,7 +28,7 @@ from crashhunt.crashes import list_bundles
 from crashhunt.errors import CrashhuntError, SimulatorError
 from crashhunt.replays import ReplayOptions, prepare
 from crashhunt.training import CrashEnv, _training_episodes as _episodes
-from crashhunt.training._crash_env import CrashReplay
+from crashhunt.training._crash_priorities import CrashReplay
 from crashhunt.training._training_episodes import _Start
 from crashhunt.trial import Outcome
 
