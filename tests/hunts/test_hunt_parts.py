@@ -106,6 +106,20 @@ def loop(running):
     return make
 
 
+def test_notice_of_an_absent_name_is_kept_until_the_name_occurs(running, loop):
+    ledger, progress, found, occurred = running.ledger, running.progress, loop(), [(), ("x names",)]
+    progress.look_at = lambda executor: None
+    found._executor, found._audit = None, SimpleNamespace(look=lambda wait_s: [])
+    found._notices = SimpleNamespace(
+        take=lambda executor: ["a"], absent=lambda *, at_end: ["x names nothing"] * at_end,
+        newly_occurred=lambda: occurred.pop(0),
+    )  # fmt: skip
+    found._receive_notices(at_end=True)
+    assert progress.notes == ledger.facts()["notices"] == ["a", "x names nothing"]
+    found._receive_notices()
+    assert (progress.notes, ledger.facts()["notices"]) == (["a", "a"], ["a"])
+
+
 def test_results_reach_the_sampler_late_enough_for_every_worker():
     free, fixed = RunSettings(deterministic=False), RunSettings(deterministic=True)
     assert _next_trials.trials_under_way(3) == 6
