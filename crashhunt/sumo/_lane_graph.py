@@ -220,6 +220,11 @@ class LaneGraph:
         )  # fmt: skip
 
     @cached_property
+    def has_stop_offsets(self) -> bool:
+        """Whether a stop line lies before the end of its lane."""
+        return any(lane.data.stop_offset_m for lane in self.lanes.values())
+
+    @cached_property
     def stop_lines(self) -> tuple[StopLine, ...]:
         """The stop lines of all lanes that end at a junction where a car may have to stop."""
         return self.stop_lines_for(USUAL_CLASS)

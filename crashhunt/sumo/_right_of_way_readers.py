@@ -200,6 +200,8 @@ def path_from(place: NetworkPlace) -> tuple[LaneLink, float] | None:
 
 def _offset_m(place: NetworkPlace) -> float:
     """Return the distance of the stop line before the next junction, or before the present one, in m."""
+    if not place.guide.graph.has_stop_offsets:
+        return 0.0
     lane = place.lane
     link = place.guide.link(place.number, lane) if lane.is_internal else None
     if link is not None:
