@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Make = Callable[[WorkerSettings, int], Executor]
 
+_WAITS_S = 150.0  # longer than any executor takes on a loaded machine, and half the limit of a trial that hangs
 _SWITCHES = ("fail_at_step", "exit_at_step", "segfault_at_step", "hang_at_step")
 
 
@@ -45,8 +46,8 @@ class ExecutorContract:
 
     @pytest.fixture
     def patient(self, make: Make, tmp_path: Path) -> Iterator[Executor]:
-        """Return an executor with two workers, in which a trial that hangs would outlive every test."""
-        yield from _made(make, tmp_path, timeout_s=3600.0)
+        """Return an executor with two workers, in which a trial may hang for minutes."""
+        yield from _made(make, tmp_path, timeout_s=2 * _WAITS_S)
 
     def _spec(self, number: int, **arguments: Value) -> TrialSpec:
         return TrialSpec(
@@ -105,7 +106,9 @@ class ExecutorContract:
         for number in range(1, 6):
             patient.submit(self._spec(number, hang_at_step=5))
         list(patient.completed(0.3))
+        began = time.monotonic()
         patient.cancel(above=0)
+        assert time.monotonic() - began < _WAITS_S, "the executor waits for a trial that hangs"
         patient.submit(self._spec(9))
         assert set(self._collect(patient, 1)) == {9}
 
@@ -144,8 +147,10 @@ class ExecutorContract:
         """Closing ends every process, regardless of what it is doing."""
         patient.submit(self._spec(0, hang_at_step=5))
         list(patient.completed(0.5))
+        began = time.monotonic()
         patient.close()
         patient.close()
+        assert time.monotonic() - began < _WAITS_S, "the executor waits for a trial that hangs"
 
 
 def _made(make: Make, folder: Path, *, timeout_s: float) -> Iterator[Executor]:

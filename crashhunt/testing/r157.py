@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from crashhunt.base.errors import CrashhuntError, UsageError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import output_file
 from crashhunt.base.foreign_code import describe_value
 from crashhunt.base.text import listed, one_line, one_of
 
@@ -99,7 +99,7 @@ def _answer(words: Sequence[str] | None) -> int:
     kind = _KINDS[given.kind]
     with (
         _opened(given.cases) as source,
-        whole_file(given.out) as made,
+        output_file(given.out) as made,
         open(made, "w", encoding="utf-8", newline="") as file,
     ):
         _write_answers(_Table(given.cases, source, kind), kind, solve, file)

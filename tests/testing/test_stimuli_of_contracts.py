@@ -466,7 +466,7 @@ def test_executor_contract_waits_until_trials_run_before_it_stops_them(tmp_path,
     assert Counter(call[0] for call in executor.calls)["where"] > 2
 
 
-@pytest.mark.parametrize(("fixture", "timeout_s"), [("executor", 2.0), ("patient", 3600.0)])
+@pytest.mark.parametrize(("fixture", "timeout_s"), [("executor", 2.0), ("patient", 300.0)])
 def test_executor_of_the_contract_has_room_for_two_and_is_closed(fixture, timeout_s, tmp_path):
     made = []
 
