@@ -19,7 +19,7 @@ class Always:
 
 
 class Steady(Always):
-    """Drives at a speed that may be set, whoever is in the way."""
+    """Drives at a speed that may be set, and reacts to no other vehicle."""
 
     def __init__(self, speed=8.0):
         self.speed = speed

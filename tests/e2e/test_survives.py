@@ -17,7 +17,7 @@ def test_what_is_printed_of_a_crash_in_traffic_is_small_and_can_be_pasted(tmp_pa
     with pytest.raises(AssertionError, match="ego drove into left") as raised:
         assert_survives("crashhunt.agents:KeepLaneWithSpeed", "loop", **words)
     (call,) = re.findall(r"^    (assert_survives\(.*\))$", str(raised.value), re.MULTILINE)
-    assert "'only': [" in call  # the others drive: whoever is moved as recorded could not be pasted
+    assert "'only': [" in call  # the others drive: actors moved as recorded could not be pasted
     with pytest.raises(AssertionError) as again:
         exec(call, {"assert_survives": assert_survives})
     assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]

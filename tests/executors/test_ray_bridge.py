@@ -248,7 +248,7 @@ def test_a_machine_is_lost_with_all_its_parts(begin):
 
 @pytest.mark.parametrize(("before_s", "hunts", "soon_s"), [(2, 0, 40), (3, 2, 5)])
 def test_an_actor_whose_cpus_another_got_is_taken_back(begin, before_s, hunts, soon_s):
-    """Two hunts that begin at once both see the same CPUs free; whoever is late says so, or waits for other nodes.
+    """Two hunts that begin at once both see the same CPUs free. The later hunt says so, or waits for other nodes.
 
     That another hunt has them is known in ten seconds on an idle machine, some of which go by until it has begun.
     """

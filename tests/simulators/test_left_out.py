@@ -51,6 +51,6 @@ def test_only_those_take_part_that_are_named(tmp_path, name):
         assert alone.keys() == {"ego"}
         assert not np.array_equal(seen[0], saw[0])  # not even in the first observation is anybody else
         others = [other for other in everybody if other != "ego"]
-        assert any((found := driven(only=(other, "nobody"))[0]).keys() == {"ego", other} for other in others)
+        assert any((found := driven(only=(other, "absent"))[0]).keys() == {"ego", other} for other in others)
         assert not np.allclose(list(found.values()), 0.0)
         assert driven()[0] == everybody
