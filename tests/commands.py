@@ -48,7 +48,7 @@ _WHILE_RUNNING = (
     "crashhunt.agents._protocol", "crashhunt.analysis._minimization_runs", "crashhunt.analysis._whatif_runs",
     "crashhunt.corpus._cases", "crashhunt.corpus._case_runs", "crashhunt.dashboard._server",
     "crashhunt.gym._descriptor", "crashhunt.highway._descriptor", "crashhunt.results._log_reader",
-    "crashhunt.samplers._space_filling", "crashhunt.samplers._strategies", "crashhunt.simulators._toy_descriptor",
+    "crashhunt.samplers._learning", "crashhunt.samplers._space_filling", "crashhunt.simulators._toy_descriptor",
     "crashhunt.suites._gate_runs", "crashhunt.suites._suite_file", "crashhunt.sumo._descriptor",
     "crashhunt.sumo._files", "crashhunt.sumo._scenario_check", "encodings.ascii", "encodings.cp437", "gzip",
     "importlib.readers", "numpy.ma", "numpy.random", "pydantic.dataclasses", "rich._emoji_codes", "rich.progress",

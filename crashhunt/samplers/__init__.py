@@ -7,12 +7,10 @@ from crashhunt.base.doors import offer_lazily
 if TYPE_CHECKING:
     from ._boundary import SAMPLE as SAMPLE, BoundarySampler as BoundarySampler, nearest_labels as nearest_labels
     from ._by_name import NamedSampler as NamedSampler, varies_only_asked as varies_only_asked
-    from ._learning import (
-        CmaEsSampler as CmaEsSampler,
-        CrossEntropySampler as CrossEntropySampler,
-        GuidedSampler as GuidedSampler,
-        MutationSampler as MutationSampler,
-    )
+    from ._cma_es import CmaEsSampler as CmaEsSampler
+    from ._cross_entropy import CrossEntropySampler as CrossEntropySampler
+    from ._guided import GuidedSampler as GuidedSampler
+    from ._mutation import MutationSampler as MutationSampler
     from ._protocol import (
         HuntFacts as HuntFacts,
         Independent as Independent,

@@ -15,9 +15,8 @@ from optuna.trial import FrozenTrial, TrialState
 from crashhunt.base.errors import PluginError, UsageError
 from crashhunt.base.extras import install_command
 from crashhunt.base.text import one_of
-from crashhunt.samplers._learning import Learning
+from crashhunt.samplers._learning import Draft, Learning, ScoredTrial, Strategy
 from crashhunt.samplers._protocol import HuntFacts, Space
-from crashhunt.samplers._strategies import Draft, ScoredTrial, Strategy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from spaces import ask, spec_of
 
 from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, NamedSampler
 from crashhunt.samplers._guided import Peaks, Portfolio
-from crashhunt.samplers._strategies import ScoredTrial
+from crashhunt.samplers._learning import ScoredTrial
 from crashhunt.space import Choice, Range
 from crashhunt.trial import Outcome, TrialResult
 

@@ -10,7 +10,7 @@ from spaces import ask, spec_of
 
 from crashhunt.samplers import Cube, GuidedSampler, HuntFacts, RandomSampler
 from crashhunt.samplers._guided import KnownCrashes
-from crashhunt.samplers._strategies import ScoredTrial, scored_trial
+from crashhunt.samplers._learning import ScoredTrial, scored_trial
 from crashhunt.space import Range
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult
 from crashhunt.world import Event

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from crashhunt.samplers import Cube
+from crashhunt.samplers._learning import ScoredTrial
 from crashhunt.samplers._model import TRIALS, Model, Process, _Parameters, _ranks
-from crashhunt.samplers._strategies import ScoredTrial
 from crashhunt.space import Choice, Range
 
 PLANE = Cube({("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)})

@@ -34,7 +34,7 @@ from unseen_problems import UNSEEN, unseen_problem
 
 from crashhunt.hunts import GREATEST_LAG, growing_lag, spec_of
 from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, plan, sampler_of
-from crashhunt.samplers import _guided, _model, _strategies
+from crashhunt.samplers import _cross_entropy, _guided, _model, _mutation
 from crashhunt.trial import Outcome, TrialResult
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def a_constant(word: str) -> tuple[ModuleType, str, float]:
     """Return the module, the name and the value of a constant of the samplers, for argparse."""
     path, _, value = word.partition("=")
     place, _, name = path.rpartition(".")
-    known = {module.__name__.rpartition(".")[2]: module for module in (_guided, _model, _strategies)}
+    known = {module.__name__.rpartition(".")[2]: module for module in (_cross_entropy, _guided, _model, _mutation)}
     if place not in known or not isinstance(getattr(known[place], name, None), int | float):
         raise argparse.ArgumentTypeError(f"{path!r} is no constant of {', '.join(known)}; give MODULE.NAME=VALUE")
     return known[place], name, type(getattr(known[place], name))(value)
