@@ -37,7 +37,13 @@ if TYPE_CHECKING:
         BicycleModel as BicycleModel,
         MotionState as MotionState,
     )
+    from ._grids_and_pictures import Raster as Raster, picture as picture
     from ._kinematics_observation import Kinematics as Kinematics, Unseen as Unseen, kind_number as kind_number
+    from ._line_of_sight import (
+        ObstacleOutlines as ObstacleOutlines,
+        RayCaster as RayCaster,
+        occluded as occluded,
+    )
     from ._observation_layout import (
         History as History,
         ObservationLayout as ObservationLayout,
@@ -109,14 +115,9 @@ if TYPE_CHECKING:
     from ._scene_parts import (
         ActorNumbers as ActorNumbers,
         NearActor as NearActor,
-        ObstacleOutlines as ObstacleOutlines,
-        Raster as Raster,
-        RayCaster as RayCaster,
         center_of as center_of,
         covariances_of as covariances_of,
         nearest_actors as nearest_actors,
-        occluded as occluded,
-        picture as picture,
         predictions_of as predictions_of,
         with_range_noise as with_range_noise,
         with_reference_point as with_reference_point,

@@ -11,16 +11,15 @@ import numpy as np
 
 from crashhunt.simulators._bicycle_model import WHEELBASE_SHARE
 from crashhunt.simulators._kinematics_observation import kind_number
+from crashhunt.simulators._line_of_sight import RayCaster, occluded
 from crashhunt.simulators._observation_layout import History, RequestedPart, layouts_of
 from crashhunt.simulators._observation_parts import REACH_M, SCENE_PARTS
 from crashhunt.simulators._scene_parts import (
     ActorNumbers,
     NearActor,
-    RayCaster,
     center_of,
     covariances_of,
     nearest_actors,
-    occluded,
     predictions_of,
     with_range_noise,
     with_reference_point,
