@@ -8,6 +8,13 @@ if TYPE_CHECKING:
     from ._anytime_interval import Bets as Bets, Interval as Interval, RateTest as RateTest
     from ._comparison import compare as compare, held_out_by_seed as held_out_by_seed
     from ._comparison_report import Comparison as Comparison, HuntFigures as HuntFigures
+    from ._counted_pairs import SideCounts as SideCounts
+    from ._counted_trials import (
+        PER_WORDS as PER_WORDS,
+        CountingRule as CountingRule,
+        Per as Per,
+        TrialFacts as TrialFacts,
+    )
     from ._gate_verdict import PairVerdict as PairVerdict, PairWatch as PairWatch
     from ._hunt_pairs import GateCase as GateCase, GateReport as GateReport, PairedHunts as PairedHunts
     from ._hunt_rate import (
@@ -16,7 +23,7 @@ if TYPE_CHECKING:
         rate_of_counts as rate_of_counts,
         rate_of_trials as rate_of_trials,
     )
-    from ._paired_test import PairTest as PairTest, SideCounts as SideCounts
+    from ._paired_test import PairTest as PairTest
     from ._rare import (
         BLOCK as BLOCK,
         TRIALS_PER_ROOT as TRIALS_PER_ROOT,
@@ -40,11 +47,5 @@ if TYPE_CHECKING:
         refuse_training_traffic as refuse_training_traffic,
     )
     from ._rate_report import CrashRate as CrashRate, RatePart as RatePart, check_confidence as check_confidence
-    from ._units_and_exposure import (
-        PER_WORDS as PER_WORDS,
-        CountingRule as CountingRule,
-        Per as Per,
-        TrialFacts as TrialFacts,
-    )
 
 offer_lazily(__name__)

@@ -25,11 +25,12 @@ from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
 from crashhunt.statistics._anytime_interval import Interval
 from crashhunt.statistics._comparison_report import ALPHA, CONFIDENCE, Answer, Comparison, HuntFigures, Pair
+from crashhunt.statistics._counted_pairs import Pair as TrialPair, PairSequence
+from crashhunt.statistics._counted_trials import PERS, CountingRule, Per, TrialFacts, facts_of_plain
 from crashhunt.statistics._hunt_rate import measure_rates
 from crashhunt.statistics._paired_rates import difference_of_rates
-from crashhunt.statistics._paired_test import Pair as TrialPair, PairSequence, PairTest
+from crashhunt.statistics._paired_test import PairTest
 from crashhunt.statistics._rate_of_running_hunt import counting_rule
-from crashhunt.statistics._units_and_exposure import PERS, CountingRule, Per, TrialFacts, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import Constant, Outcome
 

@@ -10,7 +10,7 @@ from typing import Literal, TextIO
 from crashhunt.base.codec import Serializable, null_is
 from crashhunt.base.text import format_number
 from crashhunt.statistics._anytime_interval import Interval
-from crashhunt.statistics._units_and_exposure import PER_WORDS, Per
+from crashhunt.statistics._counted_trials import PER_WORDS, Per
 from crashhunt.trial import Outcome
 
 Answer = Literal["first", "second", "undecided", ""]

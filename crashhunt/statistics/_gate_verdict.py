@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from crashhunt.statistics._paired_test import Pair, PairTest
+from crashhunt.statistics._paired_test import PairTest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
+    from crashhunt.statistics._counted_pairs import Pair
 
 
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]

@@ -19,10 +19,11 @@ from crashhunt.base.json_types import finite_values
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.statistics._comparison import why_unpaired
+from crashhunt.statistics._counted_pairs import Pair, PairSequence, SideCounts
+from crashhunt.statistics._counted_trials import TrialFacts, facts_of_plain
 from crashhunt.statistics._hunt_rate import crash_types
-from crashhunt.statistics._paired_test import Pair, PairSequence, PairTest, SideCounts
+from crashhunt.statistics._paired_test import PairTest
 from crashhunt.statistics._rate_of_running_hunt import counting_rule
-from crashhunt.statistics._units_and_exposure import TrialFacts, facts_of_plain
 from crashhunt.training import HeldOutTraffics, held_out_traffics
 from crashhunt.trial import KILLED
 

@@ -22,9 +22,9 @@ from crashhunt.base.text import one_of
 from crashhunt.crashes import fault_of, signature_of
 from crashhunt.ledger import Ledger
 from crashhunt.results import HuntResults
+from crashhunt.statistics._counted_trials import PERS, RateCounter, UnitSequence, facts_of_plain
 from crashhunt.statistics._rate_of_running_hunt import WHY_NOT_UNTIL_RATE, counting_rule, why_no_interval
 from crashhunt.statistics._rate_report import RatePart, check_confidence, make_rate
-from crashhunt.statistics._units_and_exposure import PERS, RateCounter, UnitSequence, facts_of_plain
 from crashhunt.training import held_out_traffics
 from crashhunt.trial import Choice, Range
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics._anytime_interval import Interval
+    from crashhunt.statistics._counted_trials import CountingRule, Per, TrialFacts, Unit
     from crashhunt.statistics._rate_report import CrashRate
-    from crashhunt.statistics._units_and_exposure import CountingRule, Per, TrialFacts, Unit
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Distribution, Value
 

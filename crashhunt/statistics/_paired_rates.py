@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crashhunt.statistics._anytime_interval import Bets, Interval, RateTest, log_of_sum
-from crashhunt.statistics._paired_test import Pair, failures_of
-from crashhunt.statistics._units_and_exposure import CountingRule, Per, exposure_of
+from crashhunt.statistics._counted_pairs import Pair, failures_of
+from crashhunt.statistics._counted_trials import CountingRule, Per, exposure_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -55,7 +55,7 @@ from crashhunt.base.codec import JsonObject, Serializable, plain
 from crashhunt.base.text import format_number, format_percent
 from crashhunt.disturbances import COPIES_PER_ROOT, SECONDS_PER_COPY
 from crashhunt.statistics._anytime_interval import Bets, Interval, RateTest
-from crashhunt.statistics._units_and_exposure import why_too_many_invalid
+from crashhunt.statistics._counted_trials import why_too_many_invalid
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:

@@ -16,9 +16,7 @@ from crashhunt.base.text import format_percent
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
 from crashhunt.results import CodeVersions
-from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
-from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._units_and_exposure import (
+from crashhunt.statistics._counted_trials import (
     MAX_INVALID_SHARE,
     CountingRule,
     RateCounter,
@@ -27,6 +25,8 @@ from crashhunt.statistics._units_and_exposure import (
     facts_of,
     facts_of_plain,
 )
+from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
+from crashhunt.statistics._rate_report import make_rate
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from crashhunt.ledger import Facts, Ledger, RunningRate, UntilRate
     from crashhunt.plans import HuntSettings
     from crashhunt.statistics._anytime_interval import Interval, RateTest
+    from crashhunt.statistics._counted_trials import Per, Unit
     from crashhunt.statistics._rare import RareEstimate
     from crashhunt.statistics._rate_report import CrashRate
-    from crashhunt.statistics._units_and_exposure import Per, Unit
     from crashhunt.training import HeldOutTraffics
     from crashhunt.trial import Forced, ForcedCopy, TrialResult
 

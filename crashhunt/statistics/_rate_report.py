@@ -8,7 +8,7 @@ from typing import Literal
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import UsageError
 from crashhunt.statistics._anytime_interval import BarVerdict, Interval
-from crashhunt.statistics._units_and_exposure import Per, RateCounter, UnitSequence, why_too_many_invalid
+from crashhunt.statistics._counted_trials import Per, RateCounter, UnitSequence, why_too_many_invalid
 
 _S_PER_HOUR, _M_PER_KM = 3600.0, 1000.0
 _MIN_CONFIDENCE, _MAX_CONFIDENCE = 50.0, 99.9999  # percent; above that, six digits would show 100

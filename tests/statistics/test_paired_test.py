@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from crashhunt.statistics import CountingRule, PairTest, PairWatch, TrialFacts
-from crashhunt.statistics._paired_test import PairSequence
+from crashhunt.statistics._counted_pairs import PairSequence
 from crashhunt.trial import Failure
 
 RULE = CountingRule(max_steps=9)

@@ -21,8 +21,8 @@ from crashhunt.ledger import Ledger
 from crashhunt.report import comparison_page, describe_comparison, describe_gate, describe_running, gate_summary
 from crashhunt.results import hunt_state
 from crashhunt.statistics import CountingRule, GateReport, PairedHunts, PairWatch, TrialFacts, measure_rates
+from crashhunt.statistics._counted_trials import RateCounter, UnitSequence
 from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._units_and_exposure import RateCounter, UnitSequence
 from crashhunt.training import CrashEnv, HeldOutTraffics, TrainedOn, split_crashes
 from crashhunt.training._held_out_traffics import is_test_traffic, read_trained_on
 

@@ -13,15 +13,15 @@ from hypothesis import given, strategies as st
 from crashhunt.plans import check_rate, rate_of
 from crashhunt.statistics import BarWatch, CountingRule, RateWatch, TrialFacts
 from crashhunt.statistics._anytime_interval import RateTest
-from crashhunt.statistics._rate_of_running_hunt import Paced
-from crashhunt.statistics._rate_report import make_rate
-from crashhunt.statistics._units_and_exposure import (
+from crashhunt.statistics._counted_trials import (
     MAX_INVALID_SHARE,
     RateCounter,
     UnitSequence,
     facts_of,
     facts_of_plain,
 )
+from crashhunt.statistics._rate_of_running_hunt import Paced
+from crashhunt.statistics._rate_report import make_rate
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 RULE = CountingRule(max_steps=100)
