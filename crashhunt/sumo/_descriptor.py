@@ -124,7 +124,7 @@ BACKEND: Backend = Backend(
         *(
             Configuration(
                 endings=endings,
-                load=import_at_call("crashhunt.sumo.maps._make:load_map"),
+                load=import_at_call("crashhunt.sumo.maps._cache:load_map"),
                 arguments=MAP_ARGUMENTS,
                 takes_ego=False,
                 waiting="making a scenario from the map, which is kept for the next hunt",

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._cache import cached_scenario as cached_scenario
     from ._make import (
         MapOptions as MapOptions,
         PlainTrial as PlainTrial,
-        cached_scenario as cached_scenario,
         describe_place as describe_place,
         make_scenario as make_scenario,
     )
