@@ -5,12 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._action_override import (
-        Braking as Braking,
-        HandedOver as HandedOver,
-        ReferenceCorrection as ReferenceCorrection,
-        overruled_agent as overruled_agent,
-    )
+    from ._action_override import Braking as Braking, HandedOver as HandedOver
     from ._blame import has_users_code as has_users_code, internal_error as internal_error
     from ._branches import Brancher as Brancher
     from ._episode import (
@@ -33,8 +28,15 @@ if TYPE_CHECKING:
         options_of as options_of,
         ready_recorder as ready_recorder,
     )
-    from ._parts import Parts as Parts, require_origin as require_origin, seal as seal, stage_of as stage_of
+    from ._parts import (
+        Parts as Parts,
+        overruled_agent as overruled_agent,
+        require_origin as require_origin,
+        seal as seal,
+        stage_of as stage_of,
+    )
     from ._probes import BUDGET as BUDGET, BUDGET_BESIDE as BUDGET_BESIDE, Prober as Prober
+    from ._reference_driver_correction import ReferenceCorrection as ReferenceCorrection
     from ._reference_driver_takeover import CompetentDriver as CompetentDriver
     from ._trial_signals import INFO_KEY as INFO_KEY, SIGNALS as SIGNALS, TrialSignals as TrialSignals
     from ._worker_settings import WorkerSettings as WorkerSettings, scratch_of as scratch_of

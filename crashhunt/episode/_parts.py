@@ -10,16 +10,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crashhunt.agents import FmuFactory, LibraryFactory, NeedsLibraries, ProgramFactory
+from crashhunt.agents import REFERENCE_MODELS, FmuFactory, LibraryFactory, NeedsLibraries, ProgramFactory
 from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.foreign_code import Boundary, Party, is_ours, supports
 from crashhunt.base.plugins import add_current_folder, import_module, locate
 from crashhunt.base.sandbox import confine
 from crashhunt.base.shared_memory import record_shared_memory
+from crashhunt.episode._action_override import Braking, Keeping
 from crashhunt.episode._blame import internal_error
 from crashhunt.episode._episode import seed_everything
 from crashhunt.episode._failures import record_originals
+from crashhunt.episode._reference_driver_correction import ReferenceCorrection
+from crashhunt.episode._reference_driver_takeover import CompetentDriver
 from crashhunt.oracles import parse_oracle
 from crashhunt.scenario import check_action
 from crashhunt.simulators import FlattensObservations, MasksActions, ObservesParts, ProvidesRoadMaps, ReportsNotices
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
     from crashhunt.episode._worker_settings import WorkerSettings
     from crashhunt.oracles import Oracle
     from crashhunt.simulators import Simulator
-    from crashhunt.trial import Value
+    from crashhunt.trial import Overruled, Value
 
 
 _CONSTRUCTOR_BOUNDARY: Final = Boundary(Party.AGENT, "constructor")
@@ -238,3 +241,18 @@ def require_origin(module: str, code: tuple[str, ...]) -> None:
                     where=folder,
                 )
             return
+
+
+def overruled_agent(driver: Agent, simulator: Simulator, overruled: Overruled) -> Agent:
+    """Return an agent that drives like the given agent up to a step, and is overruled after it.
+
+    Raises:
+        InvalidEpisodeError: the simulator does not support this override.
+    """
+    if overruled.reference in REFERENCE_MODELS:
+        return CompetentDriver(driver, simulator, overruled)
+    if overruled.reference:
+        return ReferenceCorrection(driver, simulator, overruled)
+    if overruled.keeps:
+        return Keeping(driver, simulator, overruled.agent, overruled.after, overruled.keeps)
+    return Braking(driver, simulator, overruled.agent, overruled.after, overruled.manoeuvre)

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crashhunt.agents import REFERENCE_MODELS, Closes, Situation
+from crashhunt.agents import REFERENCE_MODELS, Situation
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.foreign_code import supports
+from crashhunt.episode._action_override import Overruling, steering_of
 from crashhunt.scenario import ACTIONS
-from crashhunt.simulators import MAX_ACCELERATION, ReportsSurroundings, TranslatesMotion
+from crashhunt.simulators import MAX_ACCELERATION, ReportsSurroundings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -36,7 +37,7 @@ _BESIDE_M = 1.0  # lateral gap to a vehicle in the next lane that is not measure
 _MAX_LATERAL_MPS = 5.0  # a vehicle that jumps to another lane has no greater lateral speed
 
 
-class CompetentDriver:
+class CompetentDriver(Overruling):
     """Lets an agent drive, and after a step replaces it by a model when the model perceives a risk.
 
     Raises:
@@ -47,9 +48,7 @@ class CompetentDriver:
         if not supports(simulator, ReportsSurroundings):
             raise InvalidEpisodeError("the simulator reports no surroundings of the vehicle")
         self._names = tuple(simulator.actions[overruled.agent].names)
-        self._steers = (
-            simulator if supports(simulator, TranslatesMotion) and simulator.is_steered(overruled.agent) else None
-        )
+        self._steers = steering_of(simulator, overruled.agent)
         if self._names not in _FORMS and self._steers is None:
             raise InvalidEpisodeError("the actions of the agent set neither a speed nor an acceleration")
         self._driver, self._simulator, self._see = driver, simulator, simulator.surroundings
@@ -67,14 +66,9 @@ class CompetentDriver:
 
     def reset(self, seed: int) -> None:
         """Begin an episode."""
-        self._step, self._lateral_gap, self._response = 0, None, None
+        self._lateral_gap, self._response = None, None
         self._model = REFERENCE_MODELS[self._name](1, self._step_s)
-        self._driver.reset(seed)
-
-    def close(self) -> None:
-        """Close the agent."""
-        if supports(self._driver, Closes):
-            self._driver.close()
+        super().reset(seed)
 
     def act(self, observation: object) -> object:
         """Return the agent's action, or the action of the model after it has perceived the risk."""

@@ -122,7 +122,7 @@ _TESTS_ELSEWHERE = {
     "crashes/_saved_crashes.py": ("crashes/test_archive.py", "crashes/test_bundle.py"),
     "crashes/_encounter.py": ("crashes/test_danger_course.py",),
     "envs": ("envs/test_*.py",),
-    "episode/_action_override.py": ("episode/test_reference_driver.py",),
+    "episode/_reference_driver_correction.py": ("episode/test_reference_driver.py",),
     "episode/_episode.py": ("episode/test_episode*.py", "episode/test_fork.py", "native/test_usual_steps.py"),
     "episode/_fast_path.py": ("native/test_usual_steps.py", "episode/test_episode*.py"),
     "episode/_branches.py": ("episode/test_branching.py",),

@@ -8,12 +8,12 @@ import libsumo
 import numpy as np
 import pytest
 
-from crashhunt.episode import Episode
+from crashhunt.episode import Episode, overruled_agent
 from crashhunt.oracles import OffRoad
 from crashhunt.scenario import argument_values, load_scenario
 from crashhunt.sumo import Fleet, SumoSimulator
 from crashhunt.sumo._agent_calls import commanded_elsewhere, refused_calls
-from crashhunt.trial import Outcome, TrialSpec
+from crashhunt.trial import Outcome, Overruled, TrialSpec
 
 
 class Calls:
@@ -40,10 +40,12 @@ def simulator(tmp_path_factory):
     made.close()
 
 
-def driven(simulator, call, place="act", steps=6, oracles=()):
+def driven(simulator, call, place="act", steps=6, oracles=(), overruled=None):
     values = argument_values(load_scenario("loop"))
     spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=values, max_steps=steps)
     agent = Calls(call, place)
+    if overruled is not None:
+        agent = overruled_agent(agent, simulator, overruled)
     with Episode(spec, simulator=simulator, make_agent=lambda *_: agent, oracles=oracles) as episode:
         result = episode.start()
         while result is None:
@@ -79,6 +81,15 @@ def test_agent_that_changes_the_simulation_in_reset_makes_the_trial_invalid(simu
     result = driven(simulator, lambda: libsumo.vehicle.setSpeed(other(), 0.0), "reset")
     assert result.outcome is Outcome.INVALID
     assert "vehicle.setSpeed" in str(result.failure)
+
+
+@pytest.mark.parametrize(
+    "way", [{"manoeuvre": "brake"}, {"keeps": "lane"}, {"reference": "both"}, {"reference": "fsm"}]
+)
+def test_agent_that_is_overruled_cannot_change_the_simulation_either(simulator, way):
+    result = driven(simulator, lambda: libsumo.vehicle.setSpeed(other(), 0.0), overruled=Overruled("ego", 4, **way))
+    assert (result.outcome, result.steps) == (Outcome.AGENT_ERROR, 2)
+    assert "the agent called libsumo's vehicle.setSpeed" in str(result.failure)
 
 
 def test_reading_is_allowed_and_changes_nothing(simulator):
