@@ -20,13 +20,14 @@ import random
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
 from crashhunt.agents import Closes
-from crashhunt.base.errors import InternalError, InvalidEpisodeError
+from crashhunt.base.errors import InternalError, InvalidEpisodeError, UsageError
 from crashhunt.base.foreign_code import Boundary, ForeignError, Party, is_at_boundary, is_ours, supports
 from crashhunt.base.forks import held, shared_memory
 from crashhunt.episode._blame import guarded_check, guarded_reset, guarded_scene, guarded_step
@@ -467,19 +468,27 @@ class Episode(Forkable, Ending):
 
 
 def _refuse_without(agent: Agent, method: str, argument: str) -> None:
-    """Check that an agent has a method, and that a call runs it.
+    """Check that an agent has a method with one parameter, and that a call runs it.
 
     Raises:
-        ValueError: the agent has no such method, or a call only returns a coroutine or a generator.
+        UsageError: the agent has no such method, or a call of it fails or only returns a coroutine or a generator.
     """
-    found = getattr(agent, method, None)
+    found, what, fix = getattr(agent, method, None), "", f"def {method}(self, {argument})"
     if not callable(found):
-        raise ValueError(f"it has no method {method}({argument})")
-    yields = inspect.isgeneratorfunction(found)
-    if yields or inspect.iscoroutinefunction(found) or inspect.isasyncgenfunction(found):
-        what = "yields" if yields else "is async"
-        fix = "define it with def, without yield"
-        raise ValueError(f"its method {method}({argument}) {what}, so a call does not run it; {fix}")
+        raise UsageError(f"it has no method {method}({argument})", fix=f"define {fix}")
+    if inspect.isgeneratorfunction(found):
+        what, fix = "yields, so a call does not run it", f"{fix}, without yield"
+    elif inspect.iscoroutinefunction(found) or inspect.isasyncgenfunction(found):
+        what = "is async, so a call does not run it"
+    else:
+        with suppress(TypeError, ValueError):  # a function in C may have no signature
+            signature = inspect.signature(found)
+            try:
+                signature.bind(None)
+            except TypeError as error:
+                what = f"cannot be called with one argument: {error}"
+    if what:
+        raise UsageError(f"its method {method}({argument}) {what}", fix=f"define it as {fix}")
 
 
 def _require_reseeding(simulator: Simulator) -> None:

@@ -291,14 +291,23 @@ async def _waits_and_yields(*_):
 
 
 @pytest.mark.parametrize("method", ["reset", "act"])
-@pytest.mark.parametrize(("runs", "says"), [(_waits, "is async"), (_yields, "yields"), (_waits_and_yields, "is async")])
+@pytest.mark.parametrize(
+    ("runs", "says"),
+    [
+        (_waits, "is async, so a call does not run it; define it as def "),
+        (_yields, "yields, so a call does not run it; define it as def "),
+        (_waits_and_yields, "is async, so a call does not run it; define it as def "),
+        (lambda: None, "cannot be called with one argument: too many positional arguments; define it as def "),
+        (lambda _, info: None, "cannot be called with one argument: missing a required argument: 'info'; define it as"),
+    ],
+)
 def test_agent_whose_method_would_not_run_does_not_start(tmp_path, method, runs, says):
-    """A call of such a method returns an object; an asynchronous reset did nothing, without a word."""
+    """A call of a coroutine or generator returns an object: an asynchronous reset did nothing, without a word."""
     methods = {"reset": lambda seed: None, "act": lambda observation: (1.0, 0), method: runs}
     result = run(tmp_path, agent=WithoutMethods(**methods))
-    assert str(result.outcome) == "invalid"
+    assert (str(result.outcome), result.failure.kind) == ("invalid", "UsageError")  # of every value of the arguments
     assert result.failure.message.startswith(f"its method {method}(")
-    assert f") {says}, so a call does not run it; define it with def" in result.failure.message
+    assert f") {says}" in result.failure.message
 
 
 @pytest.mark.parametrize(
@@ -401,5 +410,8 @@ def test_trial_that_empties_sys_modules_is_to_blame_and_has_the_digest_of_its_st
 )
 def test_agent_without_a_method_does_not_start(tmp_path, methods, missing):
     result = run(tmp_path, agent=WithoutMethods(**methods))
-    assert (str(result.outcome), result.failure.message) == ("invalid", f"it has no method {missing}")
+    assert (str(result.outcome), result.failure.message) == (
+        "invalid",
+        f"it has no method {missing}; define def {missing.replace('(', '(self, ')}",
+    )
     assert result.failure.agent == "ego"
