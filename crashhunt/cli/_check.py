@@ -61,15 +61,14 @@ def _check(options: Options, _words: list[str]) -> int:
 
 
 def _describe(found: Checked) -> str:
-    parts = [count_of(len(found.trials), "trial")] if found.kind == "hunt" else []
     near, crashes, minimized = len(found.near_misses), found.crash_count, found.minimized
-    parts += [count_of(crashes, "crash")] if crashes or not near or found.kind == "hunt" else []
-    parts += [count_of(minimized, "minimized crash")] if minimized else []
-    parts += [count_of(near, "near miss")] if near else []
-    listed = " and ".join(", ".join(parts).rsplit(", ", 1))
-    lines = [
-        f"{command_line(found.dir)}: {listed} {'is' if parts[0].startswith('1 ') and len(parts) == 1 else 'are'} intact"
-    ]
+    counts = [(len(found.trials), "trial")] if found.kind == "hunt" else []
+    counts += [(crashes, "crash")] if crashes or not near or found.kind == "hunt" else []
+    counts += [(minimized, "minimized crash")] if minimized else []
+    counts += [(near, "near miss")] if near else []
+    listed = " and ".join(", ".join(count_of(*one) for one in counts).rsplit(", ", 1))
+    are = "is" if [count for count, _ in counts] == [1] else "are"
+    lines = [f"{command_line(found.dir)}: {listed} {are} intact"]
     if not found.fine:
         bad = [
             count_of(len(numbers), noun)

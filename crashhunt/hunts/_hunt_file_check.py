@@ -63,6 +63,10 @@ class Checked(Serializable):
         "findings",
     )  # fmt: skip
 
+    def report(self, where: Path | str, what: str, *, lost: str = "", fix: str = "", damaged: bool = True) -> None:
+        """Add a problem; the arguments are those of `CheckFinding`."""
+        self.findings.append(CheckFinding(where=str(where), what=what, lost=lost, fix=fix, damaged=damaged))
+
     @property
     def minimized(self) -> int:
         """The number of minimized crashes, which lie next to their original crashes."""
@@ -131,15 +135,11 @@ def _check_file(path: Path) -> Checked:
             found.crashes, found.damaged_crashes = inside.crashes, inside.damaged_crashes
             found.findings += inside.findings
             if not inside.crashes and not inside.damaged_crashes:
-                found.findings.append(
-                    CheckFinding(
-                        where=str(path), what="there is no crash in it", lost="the crash", fix="export it again"
-                    )
-                )
+                found.report(path, "there is no crash in it", lost="the crash", fix="export it again")
     except BundleError as error:
         if error.fix == HOW_TO_READ:
             raise
-        found.findings.append(CheckFinding(where=str(path), what=error.message, lost="the crash", fix=error.fix))
+        found.report(path, error.message, lost="the crash", fix=error.fix)
     return found
 
 
@@ -153,27 +153,17 @@ def _check_hunt(hunt: Path) -> Checked:
     _find_leftovers(found, hunt)
     if lines := unreadable_notes(hunt):
         shown = f"lines {', '.join(map(str, lines[:_MAX_SHOWN]))}" if lines[0] else "the file"
-        found.findings.append(
-            CheckFinding(
-                where=str(hunt / layout.NOTES),
-                what=f"{shown} cannot be read as notes",
-                lost="those notes",
-                fix=_NOTES_FIX,
-            )
-        )
+        fix = "add the notes again with crashhunt note, and remove these lines"
+        found.report(hunt / layout.NOTES, f"{shown} cannot be read as notes", lost="those notes", fix=fix)
     return found
-
-
-_NOTES_FIX = "add the notes again with crashhunt note, and remove these lines"
 
 
 def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
     try:
         return read_settings(hunt / layout.HUNT)
     except HuntDirectoryError as error:
-        lost = "what the hunt was asked"
         fix = "copy the hunt.toml of a snapshot there"
-        found.findings.append(CheckFinding(where=str(hunt / layout.HUNT), what=error.message, lost=lost, fix=fix))
+        found.report(hunt / layout.HUNT, error.message, lost="what the hunt was asked", fix=fix)
     for snapshot in intact_snapshots(hunt):
         with suppress(CrashhuntError):
             return snapshot.settings()
@@ -189,15 +179,12 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
     path = _ledger(hunt)
     if not has_begun(path):
         if (hunt / layout.CRASHES).is_dir() and not (hunt / layout.CASE).is_file():
-            found.findings.append(
-                CheckFinding(where=str(path), what="is missing", lost="all trials but the crashes", fix=_RESUME_FIX)
-            )
+            found.report(path, "is missing", lost="all trials but the crashes", fix=_RESUME_FIX)
         return None
     try:
         with closing(Ledger(path)) as ledger:
             if not ledger.sealed and hunt_state(hunt).state != "running":
-                note = "its writer was killed; a missing trial would not be detected"
-                found.findings.append(CheckFinding(str(path), note, damaged=False))
+                found.report(path, "its writer was killed; a missing trial would not be detected", damaged=False)
             try:
                 _read_everything(ledger)
                 found.trials = ledger.finished()
@@ -213,9 +200,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
     except HuntDirectoryError as error:
         if error.fix == HOW_TO_READ:
             raise  # nothing is damaged
-        found.findings.append(
-            CheckFinding(where=str(path), what=error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
-        )
+        found.report(path, error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
         return None
 
 
@@ -240,11 +225,7 @@ def _count_rows(found: Checked, ledger: Ledger, settings: HuntSettings | None, e
     shown = ", ".join(str(number) for number in sorted(found.damaged_trials)[:_MAX_SHOWN])
     more = len(found.damaged_trials) - _MAX_SHOWN
     lost = f"trials {shown}{f' and {more} more' if more > 0 else ''}" if shown else ""
-    found.findings.append(
-        CheckFinding(
-            where=error.where, what=error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_RESUME_FIX
-        )
-    )
+    found.report(error.where, error.message.removeprefix("the ledger is damaged: "), lost=lost, fix=_RESUME_FIX)
 
 
 def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
@@ -261,7 +242,7 @@ def _check_parts(found: Checked, hunt: Path) -> dict[str, Bundle]:
         _check_snapshot(found, hunt / layout.SNAPSHOTS / name, needed.get(name, ""))
     for folder in sorted((hunt / layout.TRIALS).glob(layout.SHOWN)):
         for fault in read_params(folder):
-            found.findings.append(CheckFinding(str(folder), fault, "what the trial printed"))
+            found.report(folder, fault, lost="what the trial printed")
     return bundles
 
 
@@ -273,16 +254,12 @@ def _check_bundle(found: Checked, folder: Path) -> Bundle | None:
     except CrashhuntError as error:
         if error.fix == HOW_TO_READ:
             raise
-        found.findings.append(
-            CheckFinding(
-                where=error.where or str(folder), what=error.message, lost=f"the crash {folder.name}", fix=_RERUN_FIX
-            )
-        )
+        found.report(error.where or folder, error.message, lost=f"the crash {folder.name}", fix=_RERUN_FIX)
         found.damaged_crashes.append(folder.name)
         return None
     for fault in faults:
         added = fault.endswith("was not there")
-        found.findings.append(CheckFinding(str(folder), fault, "" if added else "that file", damaged=not added))
+        found.report(folder, fault, lost="" if added else "that file", damaged=not added)
     if any(not fault.endswith("was not there") for fault in faults):
         found.damaged_crashes.append(folder.name)
     else:
@@ -325,24 +302,19 @@ def _check_snapshot(found: Checked, path: Path, crash: str) -> None:
     lost = f"replays of {crash} and others by the code that ran" if crash else "the code that ran"
     fix = "get a copy of it from elsewhere; replay --from-log and --code current may do without"
     if not path.is_dir():
-        found.findings.append(
-            CheckFinding(where=str(path), what="is missing", lost=lost, fix="get a copy of it from elsewhere")
-        )
+        found.report(path, "is missing", lost=lost, fix="get a copy of it from elsewhere")
         return
     snapshot = Snapshot(path)
     try:
         faults = _snapshot_faults(snapshot)
         for name in snapshot.additions():
-            note = f"{name} was added; it is no module, so it never runs"
-            found.findings.append(CheckFinding(str(path), note, damaged=False))
+            found.report(path, f"{name} was added; it is no module, so it never runs", damaged=False)
     except CrashhuntError as error:
         faults = [error.message]
     for fault in faults[:_MAX_SHOWN]:
-        found.findings.append(CheckFinding(where=str(path), what=fault, lost=lost, fix=fix))
+        found.report(path, fault, lost=lost, fix=fix)
     if len(faults) > _MAX_SHOWN:
-        found.findings.append(
-            CheckFinding(where=str(path), what=f"and {len(faults) - _MAX_SHOWN} more of its files", lost=lost, fix=fix)
-        )
+        found.report(path, f"and {len(faults) - _MAX_SHOWN} more of its files", lost=lost, fix=fix)
 
 
 def _compare(
@@ -354,32 +326,19 @@ def _compare(
     by_trial = {bundle.result.spec.number: bundle for bundle in own}
     damaged = {int(name.partition("-")[0]) for name in found.damaged_crashes if name.partition("-")[0].isdecimal()}
     for number, bundle in by_trial.items():
-        where = str(bundle.path)
         if settings is not None and bundle.hunt_seed != settings.seed:
             what = f"it is of a hunt with seed {bundle.hunt_seed}, and this one has {settings.seed}"
-            found.findings.append(CheckFinding(where=where, what=what, lost="", fix="put it back to where it is from"))
+            found.report(bundle.path, what, fix="put it back to where it is from")
         elif number not in rows:
             if number not in found.damaged_trials:
-                what = "the ledger has no crash of its trial"
-                found.findings.append(
-                    CheckFinding(
-                        where=where, what=what, lost="", fix="run the same command again: the hunt resumes with it"
-                    )
-                )
+                fix = "run the same command again: the hunt resumes with it"
+                found.report(bundle.path, "the ledger has no crash of its trial", fix=fix)
         elif rows[number].digest != bundle.result.digest or rows[number].outcome is not bundle.result.outcome:
-            found.findings.append(
-                CheckFinding(
-                    where=where, what="the ledger says something else about its trial", lost="", fix=_RERUN_FIX
-                )
-            )
+            found.report(bundle.path, "the ledger says something else about its trial", fix=_RERUN_FIX)
     for number in sorted(rows.keys() - by_trial.keys() - damaged - found.dropped):
         if hunt_state(found.dir).state != "running":
             what = f"trial {number} crashed, and its bundle is missing"
-            found.findings.append(
-                CheckFinding(
-                    where=str(found.dir / layout.CRASHES), what=what, lost="its log and evidence", fix=_RERUN_FIX
-                )
-            )
+            found.report(found.dir / layout.CRASHES, what, lost="its log and evidence", fix=_RERUN_FIX)
 
 
 def _find_leftovers(found: Checked, hunt: Path) -> None:
@@ -398,5 +357,4 @@ def _find_leftovers(found: Checked, hunt: Path) -> None:
             continue  # shrink may be writing it, here or on another host
         remembers = path.name.endswith(f"{layout.SMALL}.jsonl")
         why = "shrink resumes from it" if remembers else "its writer was killed"
-        what = f"{why}; it may be removed"
-        found.findings.append(CheckFinding(str(path), what, damaged=False))
+        found.report(path, f"{why}; it may be removed", damaged=False)
