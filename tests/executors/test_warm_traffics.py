@@ -86,11 +86,6 @@ def test_shared_warm_up_changes_no_result(pool, tmp_path, scenario):
     assert Recording(read_black_box(folder / "blackbox.bin")).digest == own[5].digest
 
 
-def test_warm_up_that_takes_no_time_is_not_shared(pool):
-    with pool(2, simulator="toy") as sharing:
-        assert [one.outcome for one in run(sharing, spec(0, 1), spec(1, 1))] == [Outcome.SURVIVED] * 2
-
-
 def test_trial_in_shared_traffic_dies_as_it_does_alone(pool, tmp_path):
     specs = [spec(0, 1), spec(1, 1, "segfaults"), spec(2, 1, "exits"), spec(3, 1)]
     with pool(2) as sharing, pool(0) as alone:
