@@ -150,17 +150,10 @@ class Bundle:
         plain = self.result.to_json()
         spec = plain["spec"]
         found: CrashSummary = {
-            "id": self.id,
-            "trial": spec["number"],
-            "seed": spec["seed"],
-            "outcome": plain["outcome"],
-            "step": plain["steps"],
-            "arguments": spec["arguments"],
-            "scenario_arguments": spec["scenario_arguments"],
-            "path": str(self.path),
-            "digest": plain["digest"],
-            "confirmed": self.confirmed,
-        }
+            "id": self.id, "trial": spec["number"], "seed": spec["seed"], "outcome": plain["outcome"],
+            "step": plain["steps"], "arguments": spec["arguments"], "scenario_arguments": spec["scenario_arguments"],
+            "path": str(self.path), "digest": plain["digest"], "confirmed": self.confirmed,
+        }  # fmt: skip
         if self.why_unconfirmed:
             found["why_unconfirmed"] = self.why_unconfirmed
         if self.is_near_miss:
@@ -183,20 +176,12 @@ class Bundle:
             "id": self.id,
             "hunt_seed": self.hunt_seed,
             "trial": spec["number"],
-            "seed": spec["seed"],
-            "max_steps": spec["max_steps"],
-            "arguments": spec["arguments"],
-            "scenario_arguments": spec["scenario_arguments"],
+            **{name: spec[name] for name in ("seed", "max_steps", "arguments", "scenario_arguments")},
             "outcome": plain["outcome"],
             "category": result.outcome.category,
             "summary": result.summary,
             "step": plain["steps"],
-            "sim_time_s": plain["sim_time_s"],
-            "collision": plain["collision"],
-            "failure": plain["failure"],
-            "escape": plain["escape"],
-            "event": plain["event"],
-            "events": plain["events"],
+            **{name: plain[name] for name in ("sim_time_s", "collision", "failure", "escape", "event", "events")},
             "closest_approach": plain["closest"],
             "digest": plain["digest"],
             "snapshot": self.snapshot,
@@ -204,15 +189,9 @@ class Bundle:
             "confirmed": self.confirmed,
             "divergence": self.divergence,
             "files": dict(self.files) or describe_other_files(folder),
+            **({"why_unconfirmed": self.why_unconfirmed} if self.why_unconfirmed else {}),
+            **{name: plain[name] for name in ("why_no_escape", "danger", "robustness") if name in plain},
         }
-        if self.why_unconfirmed:
-            data["why_unconfirmed"] = self.why_unconfirmed
-        if result.why_no_escape:
-            data["why_no_escape"] = result.why_no_escape
-        if result.danger is not None:
-            data["danger"] = plain.get("danger")
-        if result.robustness is not None:
-            data["robustness"] = plain.get("robustness")
         if result.log_likelihood is not None or result.spec.disturbances:
             data["disturbed"] = result.disturbed
             data["log_likelihood"] = plain.get("log_likelihood")

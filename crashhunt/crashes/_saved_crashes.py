@@ -17,16 +17,13 @@ from crashhunt.base.text import listed, near_path, one_of
 from crashhunt.crashes._bundle import _DAMAGE_FIX, SCHEMA, Bundle
 from crashhunt.trial import (
     Collision,
-    Disturbance,
     Escape,
     Failure,
     TrialResult,
-    TrialSpec,
     check_disturbances,
     check_parts,
-    outcome_of,
 )
-from crashhunt.world import ClosestApproach, Event, Paths
+from crashhunt.world import ClosestApproach, Event
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -206,17 +203,29 @@ _TYPES: Plain = {
     **dict.fromkeys(("disturbed", "digest_of_changes"), bool),
     **dict.fromkeys(("log_likelihood", "danger"), float | None),
     "only": list[str] | None,
+    "events": dict[str, int] | None,
     "robustness": dict[str, float | None] | None,
     **dict.fromkeys(("why_unconfirmed", "why_no_escape"), str),
     "script": dict | None,
     "authentication_code": str,
 }
+# The keys of ``crash.json`` by the fields of the trial's specification and of its result.
+_SPEC_KEYS = {
+    "number": "trial", "disturbances": "planned_disturbances",
+    **{name: name for name in ("seed", "arguments", "scenario_arguments", "max_steps", "only", "script",
+                               "digest_of_changes")},
+}  # fmt: skip
+_RESULT_KEYS = {
+    "steps": "step", "closest": "closest_approach",
+    **{name: name for name in ("outcome", "category", "sim_time_s", "digest", "collision", "failure", "escape", "event",
+                               "events", "disturbances", "log_likelihood", "danger", "robustness", "why_no_escape")},
+}  # fmt: skip
 _PARTS: Mapping[str, type] = {
     "collision": Collision, "failure": Failure, "escape": Escape, "event": Event, "closest_approach": ClosestApproach,
 }  # fmt: skip
 _KEYS = {
-    *_REQUIRED_KEYS, *_TYPES, *_PARTS, "schema", "id", "category", "summary", "events", "versions", "files",
-    "integrity", "disturbances", "planned_disturbances",
+    *_REQUIRED_KEYS, *_TYPES, *_PARTS, "schema", "id", "category", "summary", "versions", "files", "integrity",
+    "disturbances", "planned_disturbances",
 }  # fmt: skip
 
 
@@ -302,57 +311,27 @@ def changing(bundle: Bundle) -> Iterator[Bundle]:
 def _bundle(path: Path, data: JsonObject) -> Bundle:
     typed(data, _REQUIRED_KEYS)
     typed_where_there(data, _TYPES)
-    hit, failure, event, escape = data.get("collision"), data.get("failure"), data.get("event"), data.get("escape")
-    closest = data.get("closest_approach", {})
-    check_parts(closest, hit, failure, escape, event)
+    check_parts(
+        data.get("closest_approach", {}), *(data.get(name) for name in ("collision", "failure", "escape", "event"))
+    )
     for disturbances in (data.get("planned_disturbances"), data.get("disturbances")):
         check_disturbances(disturbances)
-    typed({"events": data.get("events")}, {"events": dict[str, int] | None})
     if not 0 <= data["seed"] < 2**31 or min(data["trial"], data["step"]) < 0 or data["max_steps"] < 1:
         numbers = ", ".join(f"{name} = {data[name]}" for name in ("trial", "seed", "step", "max_steps"))
         raise ValueError(f"one of these numbers is out of range: {numbers}")
     if not re.fullmatch(r"\w+", data["snapshot"]):
         raise ValueError(f"snapshot {data['snapshot']!r} is not the name of a snapshot")
-    spec = TrialSpec(
-        number=data["trial"],
-        seed=data["seed"],
-        arguments=data.get("arguments", {}),
-        scenario_arguments=data.get("scenario_arguments", {}),
-        max_steps=data["max_steps"],
-        disturbances=tuple(map(Disturbance.from_json, data.get("planned_disturbances") or ())),
-        only=tuple(only) if (only := data.get("only")) is not None else None,
-        script=Paths.from_json(script) if (script := data.get("script")) else None,
-        digest_of_changes=data.get("digest_of_changes", False),
-    )
-    result = TrialResult(
-        spec,
-        outcome_of(data),
-        steps=data["step"],
-        sim_time_s=data.get("sim_time_s", 0.0),
-        digest=data["digest"],
-        closest=ClosestApproach.from_json(closest),
-        collision=Collision.from_json(hit) if hit else None,
-        failure=Failure.from_json(failure) if failure else None,
-        escape=Escape.from_json(escape) if escape else None,
-        event=Event.from_json(event) if event else None,
-        events=data.get("events"),
-        disturbances=tuple(map(Disturbance.from_json, data.get("disturbances") or ())),
-        log_likelihood=data.get("log_likelihood"),
-        danger=data.get("danger"),
-        robustness=data.get("robustness"),
-        why_no_escape=data.get("why_no_escape", ""),
-    )
+    spec = {name: data[key] for name, key in _SPEC_KEYS.items() if key in data}
+    result = {name: data[key] for name, key in _RESULT_KEYS.items() if key in data}
+    own = ("confirmed", "divergence", "why_unconfirmed", "authentication_code")
     return Bundle(
         path=path,
-        result=result,
+        result=TrialResult.from_json({**result, "spec": spec}),
         hunt_seed=data.get("hunt_seed", 0),
         snapshot=data["snapshot"],
-        confirmed=data.get("confirmed"),
-        divergence=data.get("divergence"),
         files=data["files"],
         added=_added(data),
-        why_unconfirmed=data.get("why_unconfirmed", ""),
-        authentication_code=data.get("authentication_code", ""),
+        **{name: data[name] for name in own if name in data},
     )
 
 
