@@ -54,10 +54,9 @@ class Driver:
 TRIALS = 8
 
 
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with a hunt, an agent that was trained on its crashes, and hunts of that agent."""
-    folder = tmp_path_factory.mktemp("held-out")
+def trained(shell):
+    """A hunt, an agent that was trained on its crashes, and hunts of that agent; for `made_once`."""
+    folder = shell.folder
     (folder / "held.toml").write_text(TOY)
     (folder / "held_out_driver.py").write_text(DRIVER)
     for name, speed in (("policy", "12"), ("trained", "2")):
@@ -70,6 +69,14 @@ def place(tmp_path_factory):
         CrashEnv("before", before_s=1.0, trained_on="trained").close()
         run(folder, "after", "trained/speed.txt")
         run(folder, "elsewhere", "trained/speed.txt", seed=5)
+
+
+@pytest.fixture(scope="module")
+def place(made_once, tmp_path_factory):
+    folder = made_once(trained, Shell(tmp_path_factory.mktemp("held-out"))).folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(str(folder))
         yield folder
 
 

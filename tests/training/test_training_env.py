@@ -56,9 +56,13 @@ def hunt(folder, name, *, action="meta", trials=5, scenario="toy"):
     return folder / name
 
 
+def hunted(shell):
+    hunt(shell.folder, "hunt")
+
+
 @pytest.fixture(scope="module")
-def crashes(tmp_path_factory):
-    return hunt(tmp_path_factory.mktemp("training"), "hunt")
+def crashes(made_once, tmp_path_factory):
+    return made_once(hunted, Shell(tmp_path_factory.mktemp("training"))).folder / "hunt"
 
 
 @pytest.fixture
