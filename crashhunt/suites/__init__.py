@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ._gate_runs import Gate as Gate, GateProgress as GateProgress
     from ._gate_versions import GateVersion as GateVersion
     from ._hunt_reruns import rerun as rerun
-    from ._run_requests import RunRequest as RunRequest, trust_hunt as trust_hunt
+    from ._request_file import RunRequest as RunRequest, trust_hunt as trust_hunt
     from ._scorecard_cases import run_scorecard as run_scorecard
     from ._suite_file import (
         Suite as Suite,

@@ -41,7 +41,7 @@ from crashhunt.suites._gate_corpus import run_corpus
 from crashhunt.suites._gate_preventable_crashes import PreventableCrashes
 from crashhunt.suites._gate_versions import GateVersion, WorkTrees
 from crashhunt.suites._processes import run_all, slots_of
-from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
+from crashhunt.suites._request_file import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
 from crashhunt.training import held_out_traffics
 
 if TYPE_CHECKING:

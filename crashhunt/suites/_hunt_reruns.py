@@ -30,7 +30,7 @@ from crashhunt.results import HuntState, hunt_state
 from crashhunt.scenario import load_scenario, shipped_scenarios, with_stated_choice
 from crashhunt.snapshots import latest_snapshot
 from crashhunt.suites._processes import check_machine, run_all, set_aside
-from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
+from crashhunt.suites._request_file import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
 from crashhunt.trial import Outcome
 
 if TYPE_CHECKING:

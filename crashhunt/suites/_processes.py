@@ -32,7 +32,7 @@ from crashhunt.plans import (
 )
 from crashhunt.results import HuntDirectory
 from crashhunt.snapshots import SnapshotOptions, latest_snapshot
-from crashhunt.suites._run_requests import REQUEST, RunRequest, write_request
+from crashhunt.suites._request_file import REQUEST, RunRequest, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

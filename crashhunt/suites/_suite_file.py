@@ -22,7 +22,7 @@ from crashhunt.results import HuntState, find_hunts, hunt_state, is_hunt
 from crashhunt.scenario import load_scenario, shipped_scenarios
 from crashhunt.snapshots import code_differences, latest_snapshot
 from crashhunt.suites._processes import check_machine, run_all
-from crashhunt.suites._run_requests import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
+from crashhunt.suites._request_file import REQUEST, RunRequest, refuse_untrusted_hunt, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

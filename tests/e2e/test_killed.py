@@ -31,7 +31,7 @@ from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Hunt, check, salvage
 from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
-from crashhunt.suites import _hunt_reruns, _processes, _run_requests
+from crashhunt.suites import _hunt_reruns, _processes, _request_file
 
 # What a command does to files, and to processes; opening is one where it is for writing.
 STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link", "os.truncate", "subprocess.Popen",
@@ -224,7 +224,7 @@ def test_a_rerun_that_was_killed_while_it_sets_a_hunt_aside_loses_nothing(damage
     # A hunt that was set aside before it began is no plan of this one.
     shutil.rmtree(aside)
     aside.mkdir()
-    _run_requests.write_request(aside, replace(request, folder="/elsewhere"))
+    _request_file.write_request(aside, replace(request, folder="/elsewhere"))
     assert _processes.set_aside(hunt, lambda _: request).name == "h.replaced-1"
     shutil.rmtree(hunt)
     hunt.with_name("h.replaced-1").rename(hunt)

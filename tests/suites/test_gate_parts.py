@@ -19,7 +19,7 @@ from crashhunt.plans import AgentSettings, ArgumentSpec, HuntSettings, Request, 
 from crashhunt.statistics import SideCounts
 from crashhunt.statistics._hunt_pairs import ScenarioCounts
 from crashhunt.suites import Gate, GateVersion, RunRequest, _gate_corpus, _gate_runs as _gate, _gate_versions
-from crashhunt.suites._run_requests import REQUEST, write_request
+from crashhunt.suites._request_file import REQUEST, write_request
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
 

@@ -19,7 +19,7 @@ from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import RunRequest, _hunt_reruns, _processes, rerun
 from crashhunt.suites._processes import check_machine, run_all, set_aside
-from crashhunt.suites._run_requests import REQUEST, write_request
+from crashhunt.suites._request_file import REQUEST, write_request
 
 ASKED = RunRequest(
     Request(

@@ -23,12 +23,12 @@ from crashhunt.suites import (
     SuiteEntry,
     _hunt_reruns,
     _processes,
-    _run_requests,
+    _request_file,
     _suite_file as _suite,
     rerun,
 )
 from crashhunt.suites._processes import slots_of
-from crashhunt.suites._run_requests import REQUEST, refuse_untrusted_hunt, trust_hunt, write_request
+from crashhunt.suites._request_file import REQUEST, refuse_untrusted_hunt, trust_hunt, write_request
 
 ASKED = RunRequest(
     Request(
@@ -142,9 +142,9 @@ def test_hunt_that_has_begun_keeps_its_settings_and_takes_more_trials(hunt, monk
 
 def test_hunt_runs_again_only_where_it_is_trusted(hunt, monkeypatch):
     snapshots = []
-    monkeypatch.setattr(_run_requests, "latest_snapshot", lambda folder: snapshots[0] if snapshots else None)
-    monkeypatch.setattr(_run_requests, "is_hunt_trusted", lambda folder, snapshot: snapshot == "trusted")
-    monkeypatch.setattr(_run_requests, "describe_code", lambda snapshot, given: f"its {snapshot}")
+    monkeypatch.setattr(_request_file, "latest_snapshot", lambda folder: snapshots[0] if snapshots else None)
+    monkeypatch.setattr(_request_file, "is_hunt_trusted", lambda folder, snapshot: snapshot == "trusted")
+    monkeypatch.setattr(_request_file, "describe_code", lambda snapshot, given: f"its {snapshot}")
     refuse_untrusted_hunt(hunt)  # its request was written here
     data = json.loads((hunt / REQUEST).read_text())
     (hunt / REQUEST).write_text(json.dumps(data | {"folder": "/other"}))
@@ -179,13 +179,13 @@ def test_trust_in_a_hunt_is_in_all_its_code(hunt, monkeypatch, tmp_path):
     verified, trusted = [], []
     for name in ("b", "a", ".part"):
         (hunt / layout.SNAPSHOTS / name).mkdir(parents=True)
-    monkeypatch.setattr(_run_requests, "Snapshot", Snapshot)
-    monkeypatch.setattr(_run_requests, "trust_snapshot", lambda snapshot, path: (snapshot.place.name, path))
-    monkeypatch.setattr(_run_requests, "add_trusted", lambda *given, **more: trusted.append((given, more)) or "request")
+    monkeypatch.setattr(_request_file, "Snapshot", Snapshot)
+    monkeypatch.setattr(_request_file, "trust_snapshot", lambda snapshot, path: (snapshot.place.name, path))
+    monkeypatch.setattr(_request_file, "add_trusted", lambda *given, **more: trusted.append((given, more)) or "request")
     assert trust_hunt(hunt, tmp_path) == [("a", tmp_path), ("b", tmp_path), "request"]
     assert verified == ["a", "b"]
     (((fingerprint,), more),) = trusted
-    assert fingerprint == _run_requests._fingerprint(hunt / REQUEST)
+    assert fingerprint == _request_file._fingerprint(hunt / REQUEST)
     assert more["path"] == str(tmp_path.resolve())
     assert "mine:A" in more["runs"]
     (hunt / REQUEST).unlink()
