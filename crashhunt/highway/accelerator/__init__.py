@@ -6,7 +6,6 @@ from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
     from ._acceleration import Acceleration as Acceleration, accelerate as accelerate
-    from ._frames import TrafficFrame as TrafficFrame
     from ._kernel import Poses as Poses, kernel as kernel
     from ._lane_network import Network as Network
     from ._onlooker import Onlooker as Onlooker

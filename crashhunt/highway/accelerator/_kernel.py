@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 if TYPE_CHECKING:
+    from array import array
     from collections.abc import Callable, Sequence
 
     from highway_env.road.road import Road
     from highway_env.vehicle.kinematics import Vehicle
+    from highway_env.vehicle.objects import RoadObject
+    from numpy.typing import NDArray
 
 
 _MODULE = "_crashhunt_highway"
-_INTERFACE = 4
+_INTERFACE = 5
 
 
 class Traffic(Protocol):
@@ -59,8 +62,25 @@ class Traffic(Protocol):
     def fill_times(self, *given: object) -> None:
         """Fill the grid that `compute_ttc_grid` returns."""
 
-    def observe(self, *given: object) -> int | None:
-        """Fill the rows of a `KinematicObservation`; return their number, or None if highway-env's code must run."""
+    def neighbour_vehicles(
+        self, vehicle: RoadObject, lane: int, /
+    ) -> tuple[RoadObject | None, RoadObject | None] | None:
+        """Return the objects ahead and behind on a lane; None if the road does not have the vehicle."""
+
+    def close_objects_to(
+        self, vehicle: RoadObject, distance: float, sees_behind: bool, is_sorted: bool, only_vehicles: bool, /
+    ) -> list[RoadObject] | None:
+        """Return all objects that `Road.close_objects_to` finds; None if the road does not have the vehicle."""
+
+    def describe(
+        self, cells: NDArray[np.float64], observer: RoadObject | None, objects: list[RoadObject], features: bytes,
+        scales: array[float], clips: bool, /,
+    ) -> bool:  # fmt: skip
+        """Write a row of features for each object, from the point of view of the observer if there is one.
+
+        Returns:
+            Whether all rows were written; False if highway-env's own code must run, such as for an error in a route.
+        """
 
     def completed(self) -> int:
         """Return the number of complete sub-steps of the last call of `run`, which may have raised an error."""
@@ -69,18 +89,8 @@ class Traffic(Protocol):
 class CompiledNetwork(Protocol):
     """The lanes of a road in the kernel."""
 
-    def coordinates(self, lane: int, positions: bytes, /) -> tuple[list[float], list[float]]:
-        """Return the longitudinal and lateral coordinates on a lane, in m, of float64 positions ``x, y``."""
-
     def mark_cells(self, *grid: object) -> tuple[bytearray, list[tuple[int, float]]]:
         """Return a byte for each cell that contains a point of a lane, and the lanes with points near a cell border."""
-
-
-class Snapshot(Protocol):
-    """The members that some namespaces had at one time, for a later comparison."""
-
-    def first_changed(self, sizes: list[int], /) -> int:
-        """Return the number of the first namespace whose size or members have changed; -1 if there is none."""
 
 
 class Contents(Protocol):
@@ -98,7 +108,6 @@ class _Module(Protocol):
     INTERFACE: int
     Network: Callable[..., CompiledNetwork]
     Traffic: Callable[..., Traffic]
-    Snapshot: Callable[..., Snapshot]
     Contents: Callable[[list[object]], Contents]
 
     def bind(self, *given: object) -> None: ...

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from highway_env.vehicle.objects import Landmark, Obstacle
 
-from crashhunt.highway.accelerator._frames import are_plain
 from crashhunt.highway.accelerator._kernel import Traffic, kernel
 from crashhunt.highway.accelerator._supported import NUMBERS_OF, VehicleClass, are_numbers, kinds_of
 
@@ -79,7 +78,7 @@ class KernelObjects:
 
     def _in_kernel(self, road: Road, things: list[RoadObject], network: Network) -> Traffic | None:
         module, kinds = kernel(), self.kinds
-        if module is None or not all(kind.collides for kind in kinds) or not are_plain(things, kinds):
+        if module is None or not all(kind.collides for kind in kinds) or not _are_plain(things, kinds):
             return None
         count = len(road.vehicles)
         # Drivers evaluate a vehicle among the objects like a vehicle, which the kernel does not know.
@@ -94,6 +93,19 @@ class KernelObjects:
         lanes = network.in_kernel(looks_further=bool(self._looks_further))
         fixed = [kind.fixed for kind in kinds]
         return module.Traffic(lanes, things, bytes(models), flags, parameters, road, fixed, _examples(things, kinds))
+
+
+def _are_plain(things: list[RoadObject], kinds: list[VehicleClass]) -> bool:
+    """Return whether all positions have the usual type, no objects share an array, and no object occurs twice."""
+    if not all(kind.plain for kind in kinds):
+        return False
+    positions = [thing.position for thing in things]
+    return len(set(map(id, things))) == len(set(map(id, positions))) == len(things) and all(map(_is_place, positions))
+
+
+def _is_place(position: NDArray[np.float64]) -> bool:
+    # An unpickled array has an equal dtype that is another object.
+    return type(position) is np.ndarray and position.dtype == np.float64 and position.shape == (2,)
 
 
 def _examples(things: list[RoadObject], kinds: list[VehicleClass]) -> list[tuple[RoadObject, tuple[str, ...]]]:

@@ -11,13 +11,10 @@ from highway_env.road.lane import AbstractLane, CircularLane, SineLane, Straight
 from highway_env.road.road import RoadNetwork
 
 from crashhunt.highway.accelerator._kernel import CompiledNetwork, Contents, kernel
-from crashhunt.highway.accelerator._supported import are_numbers, is_plain
+from crashhunt.highway.accelerator._supported import are_numbers, contents_of, is_plain
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-
-_ON_LANE_MARGIN_M = 1  # highway-env's lateral margin for neighbours on a lane
+    from highway_env.road.road import LaneIndex
 
 
 class Network:
@@ -26,7 +23,6 @@ class Network:
     Attributes:
         lanes: All lanes, by number.
         index: The number of each lane, by its key.
-        number: The number of each lane, by the ``id()`` of the lane.
         keys: The keys of all lanes, ordered by number.
         compiled: The lanes in the kernel, separately for roads that also search connected lanes for neighbours and for
             others.
@@ -39,13 +35,16 @@ class Network:
         self._lane_extensions = _lane_extensions()
         self._contents = _contents(network, self.lanes)
         self.index = {key: number for number, key in enumerate(self.keys)}
-        self.number = {id(lane): number for number, lane in enumerate(self.lanes)}
         self.compiled: dict[bool, CompiledNetwork] = {}
         self.plain = type(network) is RoadNetwork and all(map(_is_known, self.lanes)) and bool(self.lanes)
 
     def is_of(self, network: RoadNetwork) -> bool:
         """Return whether the network still has the same lane objects, with unchanged keys and attributes."""
         return network is self.network and self._contents.is_same() and self._lane_extensions == _lane_extensions()
+
+    def number_of(self, key: LaneIndex) -> int | None:
+        """Return the number of a lane; None for a key that is unknown, such as a list, which is not hashable."""
+        return self.index.get(key) if type(key) is tuple else None
 
     def in_kernel(self, *, looks_further: bool) -> CompiledNetwork:
         """Return the lanes in the kernel, which must already exist.
@@ -79,20 +78,6 @@ class Network:
                 found.append((chosen, -self.lanes[chosen].length))
         return found
 
-    def coordinates(self, number: int, places: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-        """Return the longitudinal and the lateral coordinates of positions on a lane, in m.
-
-        Args:
-            number: The number of the lane.
-            places: The positions in m, of shape (positions, 2).
-        """
-        return self.in_kernel(looks_further=False).coordinates(number, places.tobytes())
-
-    def is_on(self, number: int, s: float, r: float) -> bool:
-        """Return whether highway-env's search for neighbours counts a position as on the lane."""
-        lane = self.lanes[number]
-        return bool(abs(r) <= lane.width / 2 + _ON_LANE_MARGIN_M and -5 <= s < lane.length + 5)
-
 
 def _ordered_lanes(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], list[AbstractLane]]:
     """Return all keys and lanes in highway-env's order of comparison; empty if the network is unusual.
@@ -114,8 +99,6 @@ def _ordered_lanes(network: RoadNetwork) -> tuple[list[tuple[str, str, int]], li
 
 def _contents(network: RoadNetwork, lanes: list[AbstractLane]) -> Contents:
     """Return all properties of a network that must stay unchanged: its lanes in their order, and their attributes."""
-    module = kernel()
-    assert module is not None
     containers: list[object] = []
     if type(network) is RoadNetwork:
         graph = vars(network).get("graph")
@@ -124,7 +107,7 @@ def _contents(network: RoadNetwork, lanes: list[AbstractLane]) -> Contents:
         containers += [network, *[part for part in (graph, *ends, *rows) if type(part) in (dict, list)]]
     known = [lane for lane in lanes if type(lane) in _KNOWN]
     containers += [*known, *[value for lane in known for value in vars(lane).values() if _is_array(value)]]
-    return module.Contents(containers)
+    return contents_of(containers)
 
 
 def _is_array(value: object) -> bool:

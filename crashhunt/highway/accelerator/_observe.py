@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import OrderedDict
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,11 +13,10 @@ from highway_env import utils
 from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.highway.accelerator._frames import TrafficFrame, are_plain
 from crashhunt.highway.accelerator._supported import are_numbers, kind_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
 
     from highway_env.envs.common.abstract import AbstractEnv
     from highway_env.envs.common.observation import (
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         KinematicsGoalObservation,
         OccupancyGridObservation,
     )
-    from highway_env.road.road import Road
     from highway_env.vehicle.controller import MDPVehicle
     from highway_env.vehicle.objects import RoadObject
     from numpy.typing import NDArray
@@ -34,21 +33,16 @@ if TYPE_CHECKING:
     from crashhunt.highway.accelerator._roads import RoadState
 
 
-_BASIC_FEATURES = frozenset(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))
-_LANE_FEATURES = ("long_off", "lat_off", "ang_off")
-_DESTINATION_FEATURES = ("cos_d", "sin_d")
-_UNCOMPILED_FEATURES = frozenset(
-    (*_LANE_FEATURES, *_DESTINATION_FEATURES)
-)  # highway-env's own code computes them, if they are shown
-_KNOWN_FEATURES = _BASIC_FEATURES | _UNCOMPILED_FEATURES
-_SORTED_BASIC_FEATURES = sorted(_BASIC_FEATURES)
 _CODES = {name: code for code, name in enumerate(("presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h"))}
 """The features in the order of the kernel."""
-_OBJECT_FEATURES = _BASIC_FEATURES - {"heading"}
+_LANE_FEATURES = ("long_off", "lat_off", "ang_off")
+_DESTINATION_FEATURES = ("cos_d", "sin_d")
+_UNCOMPILED_FEATURES = frozenset((*_LANE_FEATURES, *_DESTINATION_FEATURES))
+"""The features that highway-env's own code computes."""
 
 
 def close_objects(
-    frame: TrafficFrame,
+    state: RoadState,
     vehicle: Vehicle,
     distance: float,
     count: int | None,
@@ -58,160 +52,132 @@ def close_objects(
     vehicles_only: bool,
 ) -> list[RoadObject] | None:
     """Return the result of `Road.close_objects_to`; None if highway-env's own code must run."""
-    lane = frame.network.number.get(id(vehicle.lane))
-    row = frame.row.get(id(vehicle))
-    kind = kind_of(type(vehicle))
-    if lane is None or row is None or not kind.collides or not kind.is_of(vehicle):
+    if not are_numbers((distance,)):
         return None
-    road: Road = frame.road
-    total = len(road.vehicles) if vehicles_only else len(frame.things)
-    offset = frame.places[:total] - frame.places[row]
-    squared = offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1]
-    limit = -2 * vehicle.LENGTH
-    own = frame.coordinates(row, lane)[0]
-    found: list[tuple[float, int]] = []
-    for number in np.flatnonzero(squared <= (distance + 1e-3) ** 2).tolist():
-        if number == row or not np.linalg.norm(offset[number]) < distance:
-            continue
-        ahead = frame.coordinates(number, lane)[0] - own
-        if (number < len(road.vehicles) and see_behind) or limit < ahead:
-            found.append((abs(ahead), number))
-    if sort:
-        found.sort(key=lambda item: item[0])
-    if count:
-        found = found[:count]
-    return [frame.things[number] for _, number in found]
+    found = state.traffic.close_objects_to(vehicle, distance, see_behind, sort, vehicles_only)
+    return found[:count] if found and count else found
 
 
-def observe_in_kernel(kinematic: KinematicObservation, state: RoadState) -> NDArray[np.generic] | None:
-    """Return the result of `KinematicObservation.observe`; None if the kernel does not know a part of it."""
-    features, rows, env = kinematic.features, kinematic.vehicles_count, kinematic.env
-    if not _are_known(features) or not _BASIC_FEATURES.issuperset(features) or not state.roster.describes:
+def observe(kinematic: KinematicObservation, state: RoadState | None) -> NDArray[np.generic] | None:
+    """Return the result of `KinematicObservation.observe`; None if highway-env's own code must run."""
+    close = _close_to_observer(
+        kinematic, state, sort=kinematic.order == "sorted", vehicles_only=not kinematic.include_obstacles
+    )
+    return None if state is None or close is None else _visible_rows(kinematic, state, close)
+
+
+def observe_exit(kinematic: ExitObservation, state: RoadState | None) -> NDArray[np.generic] | None:
+    """Return the result of `ExitObservation.observe`; None if highway-env's own code must run."""
+    close = _close_to_observer(kinematic, state, sort=True, vehicles_only=True)
+    if state is None or close is None:
         return None
-    if type(rows) is not int or rows < 2 or not are_numbers((env.PERCEPTION_DISTANCE,)):
+    lane = state.owner.road.network.get_lane(("1", "2", -1))
+    before_exit = lane.local_coordinates(kinematic.observer_vehicle.position)[0]
+    return _visible_rows(kinematic, state, close, {"x": float(before_exit)})
+
+
+def _close_to_observer(
+    kinematic: KinematicObservation, state: RoadState | None, *, sort: bool, vehicles_only: bool
+) -> list[RoadObject] | None:
+    """Return the objects that an observation shows; None if highway-env's own code must run."""
+    rows, distance = kinematic.vehicles_count, kinematic.env.PERCEPTION_DISTANCE
+    if state is None or not state.roster.describes or type(rows) is not int or rows < 2:
         return None
-    ranges = kinematic.features_range
+    see_behind = kinematic.see_behind
+    return close_objects(
+        state, kinematic.observer_vehicle, distance, rows - 1, see_behind=see_behind, sort=sort,
+        vehicles_only=vehicles_only,
+    )  # fmt: skip
+
+
+def _visible_rows(
+    kinematic: KinematicObservation,
+    state: RoadState,
+    close: list[RoadObject],
+    replaced: Mapping[str, float] = MappingProxyType({}),
+) -> NDArray[np.generic] | None:
+    """Return the rows of the agent and of close objects; None if highway-env's own code must run.
+
+    ``replaced`` has features that replace the agent's own.
+    """
+    features, vehicle = kinematic.features, kinematic.observer_vehicle
+    if not _are_known(features):
+        return None
+    late = _UNCOMPILED_FEATURES.intersection(features)
+    if late and not all(isinstance(thing, Vehicle) for thing in close):
+        return None
+    ranges = (kinematic.features_range or _default_ranges(kinematic)) if kinematic.normalize else {}
+    scales = _scales_of(features, ranges)
+    if scales is None:
+        return None
+    shown = np.zeros((kinematic.vehicles_count, len(features)))
+    codes = bytes(_CODES.get(name, 0) for name in features)
+    describe, clip = state.traffic.describe, bool(kinematic.clip)
+    observer = None if kinematic.absolute else vehicle
+    if not describe(shown, None, [vehicle], codes, scales, clip) or not describe(
+        shown[1:], observer, close, codes, scales, clip
+    ):
+        return None
     if kinematic.normalize:
-        ranges = ranges or _default_ranges(kinematic)
-        if type(ranges) is not dict:
-            return None
+        kinematic.features_range = ranges
+    values = {(0, name): value for name, value in replaced.items() if name in features}
+    for row, thing in enumerate((vehicle, *close) if late else ()):
+        found = _late_values(thing, with_destination=row == 0 or kinematic.observe_intentions)
+        values |= {(row, name): found[name] for name in late}
+    for (row, name), value in values.items():
+        scaled = value
+        if name in ranges:
+            scaled = utils.lmap(np.float64(value), [ranges[name][0], ranges[name][1]], [-1, 1])
+            scaled = np.clip(scaled, -1, 1) if clip else scaled
+        shown[row, features.index(name)] = scaled
+    if kinematic.order == "shuffled":
+        kinematic.env.np_random.shuffle(shown[1:])
+    return shown.astype(np.float32)
+
+
+def _late_values(thing: Vehicle, *, with_destination: bool) -> dict[str, float]:
+    """Return the features of a vehicle's lane and destination, which only highway-env's own code computes."""
+    destination = thing.destination_direction.tolist() if with_destination else (0.0, 0.0)
+    return dict(
+        zip((*_LANE_FEATURES, *_DESTINATION_FEATURES), (*thing.lane_offset.tolist(), *destination), strict=True)
+    )
+
+
+def _scales_of(features: list[str], ranges: object) -> array[float] | None:
+    """Return the kernel's scales of features; None if a range is unusual."""
+    if type(ranges) is not dict:
+        return None
     scales = array("d", bytes(16 * len(features)))
-    for name, limits in ranges.items() if kinematic.normalize else ():
+    for name, limits in ranges.items():
         if name in features:
             low, high = limits[0], limits[1]
             if not are_numbers((low, high)) or not math.isfinite(high - low) or high == low:
                 return None
             column = 2 * features.index(name)
             scales[column], scales[column + 1] = low, high - low
-    shown = np.zeros((rows, len(features)))
-    found = state.traffic.observe(
-        shown,
-        kinematic.observer_vehicle,
-        bytes(map(_CODES.__getitem__, features)),
-        scales,
-        env.PERCEPTION_DISTANCE,
-        kinematic.see_behind,
-        kinematic.order == "sorted",
-        kinematic.include_obstacles,
-        kinematic.absolute,
-        kinematic.clip,
-    )
-    if found is None:
-        return None
-    kinematic.features_range = ranges
-    if kinematic.order == "shuffled":
-        env.np_random.shuffle(shown[1:])
-    return shown.astype(np.float32)
+    return scales
 
 
-def observe(kinematic: KinematicObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
-    """Return the result of `KinematicObservation.observe`; None if highway-env's own code must run."""
-    env, vehicle = kinematic.env, kinematic.observer_vehicle
-    if frame is None or not _is_known(kinematic):
-        return None
-    close = env.road.close_objects_to(
-        vehicle,
-        env.PERCEPTION_DISTANCE,
-        count=kinematic.vehicles_count - 1,
-        see_behind=kinematic.see_behind,
-        sort=kinematic.order == "sorted",
-        vehicles_only=not kinematic.include_obstacles,
-    )
-    shown = _visible_rows(kinematic, frame, close, {})
-    return None if shown is None else shown.astype(np.float32)
-
-
-def observe_exit(kinematic: ExitObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
-    """Return the result of `ExitObservation.observe`; None if highway-env's own code must run."""
-    env, vehicle = kinematic.env, kinematic.observer_vehicle
-    if frame is None or not env.road or not _is_known(kinematic):
-        return None
-    before_exit = env.road.network.get_lane(("1", "2", -1)).local_coordinates(vehicle.position)[0]
-    close = env.road.close_vehicles_to(
-        vehicle, env.PERCEPTION_DISTANCE, count=kinematic.vehicles_count - 1, see_behind=kinematic.see_behind
-    )
-    shown = _visible_rows(kinematic, frame, close, {"x": float(before_exit)})
-    return None if shown is None else shown.astype(kinematic.space().dtype)
-
-
-def _is_known(kinematic: KinematicObservation) -> bool:
-    return _are_known(kinematic.features) and _is_plain(kinematic.observer_vehicle, kinematic.features)
-
-
-def _visible_rows(
-    kinematic: KinematicObservation, frame: TrafficFrame, close: list[RoadObject], replaced: dict[str, float]
-) -> NDArray[np.float64] | None:
-    """Return the rows of the agent and of close objects; None if highway-env's own code must run.
-
-    The close objects come nearest first; if there are too many, only the last ones are used. ``replaced`` has features
-    that replace the agent's own.
-    """
-    vehicle, features = kinematic.observer_vehicle, kinematic.features
-    close = close[-kinematic.vehicles_count + 1 :]
-    if not all(_is_plain(thing, features) and _arrives(thing, frame.network) for thing in (vehicle, *close)):
-        return None
-    late = _UNCOMPILED_FEATURES.intersection(features)
-    own = _vehicle_values(vehicle, late)
-    rows = [own | replaced]
-    for thing in close:
-        values = _vehicle_values(thing, late)
-        if not kinematic.absolute:
-            for name in ("x", "y", "vx", "vy"):
-                values[name] -= own[name]
-        if not kinematic.observe_intentions:
-            values |= dict.fromkeys(_DESTINATION_FEATURES, 0.0)
-        rows.append(values)
-    shown = np.zeros((max(len(rows), kinematic.vehicles_count), len(features)))
-    for column, name in enumerate(features):
-        shown[: len(rows), column] = [values[name] for values in rows]
-    if kinematic.normalize:
-        _normalize(kinematic, shown, len(rows))
-    if kinematic.order == "shuffled":
-        kinematic.env.np_random.shuffle(shown[1:])
-    return shown
-
-
-def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:
+def observe_goal(
+    kinematic: KinematicsGoalObservation, state: RoadState | None
+) -> dict[str, NDArray[np.float64]] | None:
     """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run."""
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     goal = getattr(vehicle, "goal", None)
-    if vehicle is None or goal is None or type(features) is not list or not _BASIC_FEATURES.issuperset(features):
+    if state is None or not state.roster.describes or goal is None:
         return None
-    things = [vehicle, goal]
-    if not are_plain(things) or not all(_is_plain(thing, features) for thing in things):
+    if type(features) is not list or not _CODES.keys() >= set(features):
         return None
-    if any(
-        getattr(thing, "route", None) for thing in things
-    ):  # `to_dict` would compute the destination, which may fail
+    shown = np.zeros((2, len(features)))
+    scales = _scales_of(features, {})
+    codes = bytes(map(_CODES.__getitem__, features))
+    if scales is None or not state.traffic.describe(shown, None, [vehicle, goal], codes, scales, False):
         return None
-    here, there = (
-        np.array([values[name] for name in features]) for values in (_vehicle_values(vehicle), _vehicle_values(goal))
-    )
-    scales = kinematic.scales
-    return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
+    (here, there), by = shown, kinematic.scales
+    return OrderedDict(observation=here / by, achieved_goal=here / by, desired_goal=there / by)
 
 
-def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> NDArray[np.generic] | None:
+def observe_grid(grid: OccupancyGridObservation, state: RoadState | None) -> NDArray[np.generic] | None:
     """Return the result of `OccupancyGridObservation.observe`; None if highway-env's own code must run.
 
     The features of all vehicles are normalized in one array, without a data frame. highway-env writes the vehicles in
@@ -219,30 +185,24 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
     """
     observer, features = grid.observer_vehicle, grid.features
     shown = [name for name in features if name != "on_road"] if type(features) is list else None
-    if frame is None or grid.absolute or shown is None or not _BASIC_FEATURES.issuperset(shown):
+    if state is None or not state.roster.describes or observer is None or grid.absolute or shown is None:
         return None
     vehicles = grid.env.road.vehicles
-    if observer is None or not vehicles or type(observer.position) is not np.ndarray:
+    if not vehicles or not _CODES.keys() >= set(shown):
         return None
-    if not all(
-        _is_plain(thing, _SORTED_BASIC_FEATURES) and _arrives(thing, frame.network) for thing in (observer, *vehicles)
-    ):
-        return None
-    own = _vehicle_values(observer)
-    columns = {
-        name: np.array([values[name] for values in map(_vehicle_values, vehicles)]) for name in _SORTED_BASIC_FEATURES
-    }
-    for name in ("x", "y", "vx", "vy"):
-        columns[name] = columns[name] - own[name]
     ranges = grid.features_range or {
         "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
         "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
     }
-    if type(ranges) is not dict or not _UNCOMPILED_FEATURES.isdisjoint(ranges):
+    names = list(dict.fromkeys((*shown, "x", "y")))
+    scales = _scales_of(names, ranges)
+    if scales is None or not _UNCOMPILED_FEATURES.isdisjoint(ranges):
         return None
-    for name, limits in ranges.items():
-        if name in columns:
-            columns[name] = utils.lmap(columns[name], [limits[0], limits[1]], [-1, 1])
+    table = np.zeros((len(vehicles), len(names)))
+    codes = bytes(map(_CODES.__getitem__, names))
+    if not state.traffic.describe(table, observer, vehicles, codes, scales, False):
+        return None
+    columns = dict(zip(names, table.T, strict=True))
     places = [
         utils.lmap(columns[name], [-1, 1], [ranges[name][0], ranges[name][1]]) if name in ranges else columns[name]
         for name in ("x", "y")
@@ -250,16 +210,7 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
     if not np.isfinite(places).all():
         return None
     grid.features_range = ranges
-    grid.grid.fill(np.nan)
-    width, height = grid.grid.shape[-2:]
-    cells = [grid.pos_to_index(place, relative=True) for place in zip(*places, strict=True)] if shown else []
-    for layer, name in enumerate(features):
-        if name == "on_road":
-            grid.fill_road_layer_by_lanes(layer)
-            continue
-        for (first, second), value in zip(reversed(cells), reversed(columns[name].tolist()), strict=True):
-            if 0 <= first < width and 0 <= second < height:
-                grid.grid[layer, first, second] = value
+    _fill_cells(grid, columns, places)
     found = grid.grid
     if grid.clip:
         found = np.clip(found, -1, 1)
@@ -267,6 +218,22 @@ def observe_grid(grid: OccupancyGridObservation, frame: TrafficFrame | None) -> 
         found = ((np.clip(found, -1, 1) + 1) / 2 * 255).astype(np.uint8)
     seen: NDArray[np.generic] = np.nan_to_num(found).astype(np.uint8 if grid.as_image else np.float32)
     return seen
+
+
+def _fill_cells(
+    grid: OccupancyGridObservation, columns: dict[str, NDArray[np.float64]], places: list[NDArray[np.float64]]
+) -> None:
+    """Write the features of vehicles into the cells in which the vehicles are."""
+    grid.grid.fill(np.nan)
+    width, height = grid.grid.shape[-2:]
+    cells = [grid.pos_to_index(place, relative=True) for place in zip(*places, strict=True)]
+    for layer, name in enumerate(grid.features):
+        if name == "on_road":
+            grid.fill_road_layer_by_lanes(layer)
+            continue
+        for (first, second), value in zip(reversed(cells), reversed(columns[name].tolist()), strict=True):
+            if 0 <= first < width and 0 <= second < height:
+                grid.grid[layer, first, second] = value
 
 
 def fill_lanes(grid: OccupancyGridObservation, network: Network, layer: int, reach: float) -> bool:
@@ -340,52 +307,9 @@ def _as_tuple(value: object) -> object:
 
 def _are_known(features: object) -> bool:
     """Return whether there are features, all known and unique; a data frame repeats the column of an equal feature."""
-    if type(features) is not list or not features or not _KNOWN_FEATURES.issuperset(features):
+    if type(features) is not list or not features or not _UNCOMPILED_FEATURES.union(_CODES).issuperset(features):
         return False
     return len(set(features)) == len(features)
-
-
-def _arrives(thing: RoadObject, network: Network) -> bool:
-    """Return whether the end of a vehicle's route is on the road; otherwise highway-env's `to_dict` fails."""
-    route = getattr(thing, "route", None)
-    if not route:
-        return True
-    try:
-        start, end, number = route[-1]
-        return (start, end, 0 if number is None else number) in network.index
-    except (LookupError, TypeError, ValueError):
-        return False
-
-
-def _is_plain(thing: RoadObject, features: list[str]) -> bool:
-    kind = kind_of(type(thing))
-    if not kind.describes or not kind.is_of(thing) or not are_numbers((thing.heading, thing.speed)):
-        return False
-    return isinstance(thing, Vehicle) or _OBJECT_FEATURES.issuperset(features)
-
-
-def _vehicle_values(thing: RoadObject, late: Iterable[str] = ()) -> dict[str, float]:
-    """Return those values of highway-env's `to_dict` that observations use.
-
-    ``late`` has the features of the lane and the destination that are shown.
-    """
-    x, y = thing.position.tolist()
-    c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))
-    vx, vy = (float(thing.speed) * c, float(thing.speed) * s) if isinstance(thing, Vehicle) else (0.0, 0.0)
-    values = {
-        "presence": 1.0,
-        "x": x,
-        "y": y,
-        "vx": vx,
-        "vy": vy,
-        "heading": float(thing.heading),
-        "cos_h": c,
-        "sin_h": s,
-    }
-    if late:
-        values |= zip(_LANE_FEATURES, thing.lane_offset.tolist(), strict=True)
-        values |= zip(_DESTINATION_FEATURES, thing.destination_direction.tolist(), strict=True)
-    return values
 
 
 def _default_ranges(kinematic: KinematicObservation) -> dict[str, list[float]]:
@@ -397,13 +321,3 @@ def _default_ranges(kinematic: KinematicObservation) -> dict[str, list[float]]:
         "vx": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
         "vy": [-2 * Vehicle.MAX_SPEED, 2 * Vehicle.MAX_SPEED],
     }
-
-
-def _normalize(kinematic: KinematicObservation, shown: NDArray[np.float64], rows: int) -> None:
-    if not kinematic.features_range:
-        kinematic.features_range = _default_ranges(kinematic)
-    for name, limits in kinematic.features_range.items():
-        if name in kinematic.features:
-            column = kinematic.features.index(name)
-            scaled = utils.lmap(shown[:rows, column], [limits[0], limits[1]], [-1, 1])
-            shown[:rows, column] = np.clip(scaled, -1, 1) if kinematic.clip else scaled

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
-from crashhunt.highway.accelerator._frames import TrafficFrame
 from crashhunt.highway.accelerator._kernel_objects import KernelObjects
 from crashhunt.highway.accelerator._lane_network import Network
 from crashhunt.highway.accelerator._supported import Own, Watch, is_plain, kinds_of
@@ -29,7 +28,6 @@ class Prepared:
     def __init__(self, road: Road) -> None:
         self.road = road  # keeps the road alive, so that no other road can get its id()
         self.network = Network(road.network)  # the lanes of the road
-        self.frame: TrafficFrame | None = None  # the positions when they were last read
         # whether no foreign code runs between the sub-steps of the road, so that the state stays valid
         self.alone = False
         # whether a step of the environment runs, in which the observation follows the last sub-step
@@ -146,8 +144,7 @@ class _RoadKind:
     def __init__(self, kind: type[Road]) -> None:
         base = RegulatedRoad if issubclass(kind, RegulatedRoad) else Road
         self.own = Own(kind, base, _READ_ATTRIBUTES)
-        self.is_seen = self.own.plain  # whether the accelerator may search the road's vehicles and objects
-        # whether, in addition, the class overrides no method that the accelerator bypasses
+        # whether the class overrides no attribute that the accelerator reads, and no method that it bypasses
         self.is_known = self.own.plain and not any(map(self.own.has, _BYPASSED_METHODS))
 
 
@@ -166,27 +163,17 @@ _road_kinds: dict[type, _RoadKind] = {}
 
 
 def is_known(road: Road) -> bool:
-    """Return whether the kernel may drive a road's vehicles, because the road's class and highway-env are unchanged."""
-    return _kind_of(road).is_known and _is_usual(road)
+    """Return whether the kernel may drive and search a road's vehicles.
 
-
-def _is_seen(road: Road) -> bool:
-    """Return whether the vehicles and objects of a road may be searched, possibly by the road class's own search."""
-    return _kind_of(road).is_seen and _is_usual(road)
-
-
-def _kind_of(road: Road) -> _RoadKind:
+    The road's class and highway-env must be unchanged, and the road must not have methods of its own.
+    """
     kind = type(road)
     found = _road_kinds.get(kind)
     if found is None or not found.own.current:
         found = _road_kinds[kind] = _RoadKind(kind)
-    return found
-
-
-def _is_usual(road: Road) -> bool:
-    """Return whether no function of highway-env and no method of this road has been replaced."""
     return (
-        is_intact("roads")
+        found.is_known
+        and is_intact("roads")
         and type(road.vehicles) is list
         and type(road.objects) is list
         and _ROAD_METHODS.isdisjoint(vars(road))
@@ -195,18 +182,8 @@ def _is_usual(road: Road) -> bool:
 
 def network_of(road: Road) -> Network | None:
     """Return the lanes of a road; None if the road is unknown."""
-    found = prepared(road) if _is_seen(road) else None
+    found = prepared(road) if is_known(road) else None
     return found.network if found is not None else None
-
-
-def frame_of(road: Road) -> TrafficFrame | None:
-    """Return the current positions on a road; None if the road or an object is unknown."""
-    found = prepared(road) if _is_seen(road) else None
-    if found is None:
-        return None
-    if found.frame is None or not found.frame.is_of(road):
-        found.frame = TrafficFrame(found.network, road)
-    return found.frame if found.frame.plain else None
 
 
 def methods_of(kind: type) -> frozenset[str]:

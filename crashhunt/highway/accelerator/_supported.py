@@ -20,7 +20,7 @@ from highway_env.envs.common import abstract, action, finite_mdp, observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, dynamics, kinematics, objects
 
-from crashhunt.highway.accelerator._kernel import Snapshot, kernel, why_not
+from crashhunt.highway.accelerator._kernel import Contents, kernel, why_not
 from crashhunt.highway.accelerator._known_versions import ACCELERATED, reason_against_version
 
 if TYPE_CHECKING:
@@ -55,8 +55,9 @@ class Watch:
     def __init__(self, places: Iterable[tuple[str, Space]], but: Iterable[str] = ()) -> None:
         skipped = frozenset(but)
         self._places: list[_Place] = [_Place(name, owner, skipped) for name, owner in places]
+        self._changed: _Place | None = None
         self._reported = ""
-        self._snapshot: Snapshot | None = None
+        self._contents: Contents | None = None
 
     @classmethod
     def of_roads(cls, but: Iterable[str]) -> Watch:
@@ -81,22 +82,19 @@ class Watch:
     @property
     def intact(self) -> bool:
         """Return whether no member has changed; each changed member is logged once."""
-        snapshot = self._snapshot
-        if snapshot is None:
-            # Another thread may read both attributes at any time, so the sizes exist before the snapshot.
-            self._sizes = [place.size for place in self._places]
-            self._snapshot = snapshot = snapshot_of([(place.owner, place.members) for place in self._places])
-        while (number := snapshot.first_changed(self._sizes)) >= 0:
-            place = self._places[number]
-            changed = place.changed()
-            if changed:
-                if changed != self._reported:
-                    self._reported = changed
-                    message = "the accelerator is disabled: %s has been replaced"
-                    logging.getLogger("crashhunt").warning(message, changed)
-                return False
-            self._sizes[number] = len(place.space)  # a new member that does not matter
-        return True
+        if self._contents is not None and self._contents.is_same():
+            return True
+        contents = contents_of([place.owner for place in self._places])  # another thread may change them from here on
+        suspects = [self._changed] if self._changed is not None and self._changed.changed() else self._places
+        self._changed = next((place for place in suspects if place.changed()), None)
+        if self._changed is None:
+            self._contents = contents  # a changed or new member that does not matter
+            return True
+        changed = self._changed.changed()
+        if changed != self._reported:
+            self._reported = changed
+            logging.getLogger("crashhunt").warning("the accelerator is disabled: %s has been replaced", changed)
+        return False
 
     @property
     def reason(self) -> str:
@@ -112,7 +110,6 @@ class _Place:
         self.owner = owner
         self.space: Mapping[str, object] = vars(owner) if isinstance(owner, type) else owner
         space = self.space
-        self.size = len(space)
         if names is None:
             names = tuple(
                 key
@@ -149,13 +146,11 @@ def _special(name: str) -> bool:
     return name in ("__doc__", "__builtins__", "__dict__", "__weakref__", "_abc_impl", "__warningregistry__")
 
 
-def snapshot_of(spaces: Iterable[tuple[Space, Mapping[str, object]]]) -> Snapshot:
-    """Return a snapshot of the members of namespaces in the kernel, with which changes are found in microseconds."""
+def contents_of(containers: Iterable[object]) -> Contents:
+    """Return the contents of namespaces and other containers in the kernel, which finds changes in microseconds."""
     module = kernel()
     assert module is not None
-    owners, members = zip(*spaces, strict=True)
-    names = tuple(tuple(part) for part in members)
-    return module.Snapshot(tuple(owners), names, tuple(tuple(part.values()) for part in members))
+    return module.Contents(list(containers))
 
 
 def _classes(module: ModuleType) -> list[tuple[str, type]]:
@@ -283,8 +278,7 @@ class Own:
         self._mro = kind.__mro__
         # The members that a user can change later; `Watch` covers highway-env's own classes.
         parts = [part for part in self._mro if id(part) not in _CLASSES_WATCHED]
-        self._sizes = [len(vars(part)) for part in parts]
-        self._snapshot = snapshot_of([(part, vars(part)) for part in parts]) if parts else None
+        self._contents = contents_of(parts)
         values = {*values, *(name for name in dir(base) if is_plain(inspect.getattr_static(base, name)))}
         self.names = [name for name in _SPECIAL if self.has(name)]
         self.names += [name for name in sorted(values) if name[:2] != "__" and not is_plain(self._member(name))]
@@ -300,9 +294,7 @@ class Own:
     @property
     def current(self) -> bool:
         """Return whether the class has not changed since this object was created."""
-        return self._kind.__mro__ is self._mro and (
-            self._snapshot is None or self._snapshot.first_changed(self._sizes) < 0
-        )
+        return self._kind.__mro__ is self._mro and self._contents.is_same()
 
 
 class VehicleClass:

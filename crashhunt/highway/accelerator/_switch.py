@@ -28,11 +28,9 @@ from crashhunt.highway.accelerator._observe import (
     observe_exit,
     observe_goal,
     observe_grid,
-    observe_in_kernel,
 )
 from crashhunt.highway.accelerator._roads import (
     forget,
-    frame_of,
     is_intact,
     look,
     methods_of,
@@ -187,14 +185,10 @@ def _rewards(self: HighwayEnv, action: object) -> dict[str, float]:
 
 
 def _neighbour_vehicles(self: Road, vehicle: Vehicle, lane_index: LaneIndex | None = None) -> object:
-    frame = frame_of(self)
-    row = frame.row.get(id(vehicle)) if frame is not None else None
-    key = lane_index or vehicle.lane_index
-    if frame is not None and row is not None and key:
-        found = frame.neighbours(vehicle, row, key)
-        if found is not None:
-            return found
-    return originals["Road.neighbour_vehicles"](self, vehicle, lane_index)
+    state = look(self)
+    lane = state.owner.network.number_of(lane_index or vehicle.lane_index) if state is not None else None
+    found = state.traffic.neighbour_vehicles(vehicle, lane) if state is not None and lane is not None else None
+    return found or originals["Road.neighbour_vehicles"](self, vehicle, lane_index)
 
 
 def _close_objects_to(
@@ -206,10 +200,10 @@ def _close_objects_to(
     sort: bool = True,
     vehicles_only: bool = False,
 ) -> object:
-    frame = frame_of(self)
-    if frame is not None:
+    state = look(self)
+    if state is not None:
         found = close_objects(
-            frame, vehicle, distance, count, see_behind=see_behind, sort=sort, vehicles_only=vehicles_only
+            state, vehicle, distance, count, see_behind=see_behind, sort=sort, vehicles_only=vehicles_only
         )
         if found is not None:
             return found
@@ -228,14 +222,9 @@ def _enforce_road_rules(self: RegulatedRoad) -> None:
 def _observe(self: KinematicObservation) -> object:
     road = self.env.road
     kept = take_for_observation(road)
-    if _is_plain(self, KinematicObservation) and _searches(road):
-        state = kept or look(road)
-        found = observe_in_kernel(self, state) if state is not None else None
-        if found is None:
-            found = observe(self, frame_of(road))
-        if found is not None:
-            return found
-    return originals["KinematicObservation.observe"](self)
+    can_search = _is_plain(self, KinematicObservation) and _searches(road)
+    found = observe(self, kept or look(road)) if can_search else None
+    return found if found is not None else originals["KinematicObservation.observe"](self)
 
 
 def _searches(road: Road) -> bool:
@@ -245,24 +234,19 @@ def _searches(road: Road) -> bool:
 
 
 def _observe_exit(self: ExitObservation) -> object:
-    if _is_plain(self, ExitObservation) and _searches(self.env.road):
-        found = observe_exit(self, frame_of(self.env.road))
-        if found is not None:
-            return found
-    return originals["ExitObservation.observe"](self)
+    can_search = _is_plain(self, ExitObservation) and _searches(self.env.road)
+    found = observe_exit(self, look(self.env.road)) if can_search else None
+    return found if found is not None else originals["ExitObservation.observe"](self)
 
 
 def _observe_goal(self: KinematicsGoalObservation) -> object:
-    found = observe_goal(self) if _is_plain(self, KinematicsGoalObservation) else None
+    found = observe_goal(self, look(self.env.road)) if _is_plain(self, KinematicsGoalObservation) else None
     return found if found is not None else originals["KinematicsGoalObservation.observe"](self)
 
 
 def _observe_grid(self: OccupancyGridObservation) -> object:
-    if _is_plain(self, OccupancyGridObservation):
-        found = observe_grid(self, frame_of(self.env.road))
-        if found is not None:
-            return found
-    return originals["OccupancyGridObservation.observe"](self)
+    found = observe_grid(self, look(self.env.road)) if _is_plain(self, OccupancyGridObservation) else None
+    return found if found is not None else originals["OccupancyGridObservation.observe"](self)
 
 
 def _fill_road_layer_by_lanes(

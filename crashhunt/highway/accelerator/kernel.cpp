@@ -267,58 +267,95 @@ PyObject *traffic_fill_times(Traffic *self, PyObject *args) {
     Py_RETURN_NONE;
 }
 
-// observe(cells, observer, features, scales, distance, sees_behind, is_sorted, includes_objects, is_absolute, clips): the
-// number of rows that it writes into the cells, of which there are enough; None if highway-env must observe. A feature is
-// a byte, and its scale two floats: the lower end, and the length of the interval, which is 0 for no scale.
-PyObject *traffic_observe(Traffic *self, PyObject *args) {
-    Py_buffer cells, features, numbers;
-    PyObject *object;
-    Search search;
-    int sees_behind, is_sorted, includes_objects, is_absolute, clips;
-    if (!PyArg_ParseTuple(args, "w*Oy*y*dppppp", &cells, &object, &features, &numbers, &search.distance, &sees_behind,
-                          &is_sorted, &includes_objects, &is_absolute, &clips)) {
+// The row of a vehicle or object; NO_ROW if the road does not have it.
+size_t row_of(const Traffic *self, PyObject *object) {
+    const std::vector<Actor> &actors = *self->actors;
+    const auto which = std::find_if(actors.begin(), actors.end(), [object](const Actor &actor) { return actor.object == object; });
+    return which == actors.end() ? NO_ROW : static_cast<size_t>(which - actors.begin());
+}
+
+PyObject *object_at(const Traffic *self, size_t row) { return row == NO_ROW ? Py_None : (*self->actors)[row].object; }
+
+// neighbour_vehicles(vehicle, lane): the objects ahead and behind; None if the road does not have the vehicle.
+PyObject *traffic_neighbour_vehicles(Traffic *self, PyObject *args) {
+    PyObject *vehicle;
+    int lane;
+    if (!PyArg_ParseTuple(args, "Oi", &vehicle, &lane)) {
         return nullptr;
     }
-    const size_t columns = static_cast<size_t>(features.len), line = columns * sizeof(double);
-    const size_t lines = columns ? static_cast<size_t>(cells.len) / line : 0;
+    const size_t row = row_of(self, vehicle);
+    if (lane < 0 || static_cast<size_t>(lane) >= self->lanes) {
+        return PyErr_Format(PyExc_IndexError, "no such lane");
+    }
+    if (row == NO_ROW) {
+        Py_RETURN_NONE;
+    }
+    size_t front, rear;
+    neighbour_vehicles(self, row, lane, front, rear);
+    return PyTuple_Pack(2, object_at(self, front), object_at(self, rear));
+}
+
+// close_objects_to(vehicle, distance, sees_behind, is_sorted, only_vehicles): a list; None if the road does not have the
+// vehicle.
+PyObject *traffic_close_objects_to(Traffic *self, PyObject *args) {
+    PyObject *vehicle;
+    double distance;
+    int sees_behind, is_sorted, only_vehicles;
+    if (!PyArg_ParseTuple(args, "Odppp", &vehicle, &distance, &sees_behind, &is_sorted, &only_vehicles)) {
+        return nullptr;
+    }
+    const size_t row = row_of(self, vehicle), count = only_vehicles ? self->vehicles : self->actors->size();
+    if (row >= self->vehicles) {
+        Py_RETURN_NONE;
+    }
+    PyObject *found = PyList_New(0);
+    for (size_t other : close_objects_to(self, row, distance, sees_behind, is_sorted, count)) {
+        if (found && PyList_Append(found, object_at(self, other))) {
+            Py_CLEAR(found);
+        }
+    }
+    return found;
+}
+
+// describe(cells, observer, objects, features, scales, clips): writes a row for each object into the cells, from the
+// point of view of the observer, unless it is None; returns whether highway-env would describe all of them without an
+// error. A feature is a byte, and its scale two floats: the lower end, and the length of the interval, which is 0 for no
+// scale.
+PyObject *traffic_describe(Traffic *self, PyObject *args) {
+    Py_buffer cells, features, numbers;
+    PyObject *observer, *objects;
+    int clips;
+    if (!PyArg_ParseTuple(args, "w*OO!y*y*p", &cells, &observer, &PyList_Type, &objects, &features, &numbers, &clips)) {
+        return nullptr;
+    }
+    const size_t columns = static_cast<size_t>(features.len), lines = static_cast<size_t>(PyList_GET_SIZE(objects));
     const char *codes = static_cast<const char *>(features.buf);
     std::vector<Scale> scales(columns);
-    bool fits = lines > 1 && static_cast<size_t>(numbers.len) == 2 * line;
+    bool fits = static_cast<size_t>(numbers.len) == 2 * columns * sizeof(double) &&
+                static_cast<size_t>(cells.len) >= lines * columns * sizeof(double);
     for (size_t column = 0; fits && column < columns; column++) {
         double given[2];
         std::memcpy(given, static_cast<const char *>(numbers.buf) + column * sizeof(given), sizeof(given));
         scales[column] = {given[0], given[1], given[1] != 0};
         fits = codes[column] >= 0 && codes[column] < FEATURES;
     }
-    PyObject *found = nullptr;
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the cells have another size than their parts");
-    } else {
-        const std::vector<Actor> &actors = *self->actors;
-        const auto which = std::find_if(actors.begin(), actors.end(), [object](const Actor &actor) { return actor.object == object; });
-        const size_t row = static_cast<size_t>(which - actors.begin());
-        search.sees_behind = sees_behind;
-        search.is_sorted = is_sorted;
-        search.includes_objects = includes_objects;
-        search.most = lines - 1;
-        if (row < self->vehicles) {
-            std::vector<size_t> close = close_objects_to(self, row, search);
-            bool all = arrives(self->network, actors[row]);
-            for (size_t other : close) {
-                // highway-env does not describe the heading of an object that is no vehicle.
-                all = all && (actors[other].moves ? arrives(self->network, actors[other]) : !std::memchr(codes, HEADING, columns));
-            }
-            if (all) {
-                show(self, row, close, codes, scales.data(), columns, is_absolute, clips, static_cast<double *>(cells.buf));
-                found = PyLong_FromSize_t(close.size() + 1);
-            }
+    const size_t from = row_of(self, observer);
+    bool all = observer == Py_None || from != NO_ROW;
+    for (size_t line = 0; fits && all && line < lines; line++) {
+        const size_t row = row_of(self, PyList_GET_ITEM(objects, static_cast<Py_ssize_t>(line)));
+        all = row != NO_ROW && is_described(self->network, (*self->actors)[row], codes, columns);
+        if (all) {
+            describe((*self->actors)[row], from == NO_ROW ? nullptr : &(*self->actors)[from], codes, scales.data(), columns,
+                     clips, static_cast<double *>(cells.buf) + line * columns);
         }
-        found = found || PyErr_Occurred() ? found : Py_NewRef(Py_None);
     }
     PyBuffer_Release(&cells);
     PyBuffer_Release(&features);
     PyBuffer_Release(&numbers);
-    return found;
+    if (!fits) {
+        return PyErr_Format(PyExc_ValueError, "the cells have another size than their parts");
+    }
+    return PyErr_Occurred() ? nullptr : PyBool_FromLong(all);
 }
 
 PyObject *traffic_completed(Traffic *self, PyObject *) { return PyLong_FromLong(self->completed); }
@@ -332,7 +369,9 @@ PyMethodDef traffic_methods[] = {
     {"completed", reinterpret_cast<PyCFunction>(traffic_completed), METH_NOARGS, nullptr},
     {"run", reinterpret_cast<PyCFunction>(traffic_run), METH_VARARGS, nullptr},
     {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_NOARGS, nullptr},
-    {"observe", reinterpret_cast<PyCFunction>(traffic_observe), METH_VARARGS, nullptr},
+    {"neighbour_vehicles", reinterpret_cast<PyCFunction>(traffic_neighbour_vehicles), METH_VARARGS, nullptr},
+    {"close_objects_to", reinterpret_cast<PyCFunction>(traffic_close_objects_to), METH_VARARGS, nullptr},
+    {"describe", reinterpret_cast<PyCFunction>(traffic_describe), METH_VARARGS, nullptr},
     {"fill_times", reinterpret_cast<PyCFunction>(traffic_fill_times), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
@@ -410,33 +449,6 @@ PyObject *network_new(PyTypeObject *type, PyObject *args, PyObject *) {
     }
     PyBuffer_Release(&table);
     return reinterpret_cast<PyObject *>(self);
-}
-
-// coordinates(lane, positions): the longitudinal and the lateral coordinates of positions, in two lists.
-PyObject *network_coordinates(Network *self, PyObject *args) {
-    int number;
-    Py_buffer positions;
-    if (!PyArg_ParseTuple(args, "iy*", &number, &positions)) {
-        return nullptr;
-    }
-    const Py_ssize_t count = positions.len / static_cast<Py_ssize_t>(2 * sizeof(double));
-    PyObject *along = PyList_New(count), *across = PyList_New(count), *both = nullptr;
-    if (number < 0 || static_cast<size_t>(number) >= self->lanes->size()) {
-        PyErr_SetString(PyExc_IndexError, "no such lane");
-    } else if (along && across) {
-        for (Py_ssize_t row = 0; row < count && !PyErr_Occurred(); row++) {
-            double place[2], s, r;
-            std::memcpy(place, static_cast<const char *>(positions.buf) + row * sizeof(place), sizeof(place));
-            self->lane(number).local_coordinates(place[0], place[1], s, r);
-            PyList_SET_ITEM(along, row, PyFloat_FromDouble(s));
-            PyList_SET_ITEM(across, row, PyFloat_FromDouble(r));
-        }
-        both = PyErr_Occurred() ? nullptr : PyTuple_Pack(2, along, across);
-    }
-    Py_XDECREF(along);
-    Py_XDECREF(across);
-    PyBuffer_Release(&positions);
-    return both;
 }
 
 // The grid of an occupancy grid observation, in m: its axes are those of the observer, or those of the world.
@@ -527,7 +539,6 @@ PyObject *network_mark_cells(Network *self, PyObject *args) {
 
 PyMethodDef network_methods[] = {
     {"mark_cells", reinterpret_cast<PyCFunction>(network_mark_cells), METH_VARARGS, nullptr},
-    {"coordinates", reinterpret_cast<PyCFunction>(network_coordinates), METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 
@@ -714,7 +725,7 @@ PyMODINIT_FUNC PyInit__crashhunt_highway() {
     const struct {
         const char *name;
         PyType_Spec *spec;
-    } types[] = {{"Network", &network_spec}, {"Traffic", &traffic_spec}, {"Snapshot", &snapshot_spec}, {"Contents", &contents_spec}};
+    } types[] = {{"Network", &network_spec}, {"Traffic", &traffic_spec}, {"Contents", &contents_spec}};
     for (const auto &type : types) {
         PyObject *made = module ? PyType_FromSpec(type.spec) : nullptr;
         if (!made || PyModule_AddObjectRef(module, type.name, made)) {

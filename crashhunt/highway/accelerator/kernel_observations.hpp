@@ -1,4 +1,4 @@
-// What an agent sees of the road: `KinematicObservation` with its basic features. A part of kernel.cpp.
+// What an agent sees of the road: the objects near it, and their basic features. A part of kernel.cpp.
 
 #pragma once
 
@@ -15,35 +15,27 @@ struct Scale {
     bool is_used;
 };
 
-// What `Road.close_objects_to` is asked.
-struct Search {
-    double distance; // in m
-    size_t most;
-    bool sees_behind, is_sorted, includes_objects;
-};
-
-// `Road.close_objects_to`: the rows of objects near a vehicle.
-std::vector<size_t> close_objects_to(Traffic *self, size_t row, const Search &search) {
+// `Road.close_objects_to` without a limit to their number: the rows of objects within a distance (m) of a vehicle.
+std::vector<size_t> close_objects_to(Traffic *self, size_t row, double limit, bool sees_behind, bool is_sorted, size_t count) {
     const std::vector<Actor> &actors = *self->actors;
     const Actor &observer = actors[row];
     std::vector<std::pair<double, size_t>> found;
-    const size_t count = search.includes_objects ? actors.size() : self->vehicles;
     for (size_t other = 0; other < count; other++) {
         const double dx = actors[other].x - observer.x, dy = actors[other].y - observer.y;
-        if (other == row || !(std::sqrt(dot(dx, dy, dx, dy)) < search.distance)) {
+        if (other == row || !(std::sqrt(dot(dx, dy, dx, dy)) < limit)) {
             continue;
         }
         const double ahead = lane_distance(self, row, other);
-        if ((search.sees_behind && actors[other].moves) || -2 * observer.parameters.length < ahead) {
+        if ((sees_behind && actors[other].moves) || -2 * observer.parameters.length < ahead) {
             found.emplace_back(std::fabs(ahead), other);
         }
     }
-    if (search.is_sorted) {
+    if (is_sorted) {
         std::stable_sort(found.begin(), found.end(), [](const auto &one, const auto &two) { return one.first < two.first; });
     }
     std::vector<size_t> rows;
-    for (size_t at = 0; at < found.size() && at < search.most; at++) {
-        rows.push_back(found[at].second);
+    for (const auto &[ahead, other] : found) {
+        rows.push_back(other);
     }
     return rows;
 }
@@ -62,31 +54,32 @@ bool arrives(const Network *network, const Actor &actor) {
 }
 
 double feature(const Actor &actor, int which) {
-    const double speed = actor.moves ? actor.speed.value : 0;
-    const double values[FEATURES] = {1,       actor.x,      actor.y,     speed * actor.cosine, speed * actor.sine, actor.heading,
-                                     actor.cosine, actor.sine};
+    const double vx = actor.moves ? actor.speed.value * actor.cosine : 0, vy = actor.moves ? actor.speed.value * actor.sine : 0;
+    const double values[FEATURES] = {1, actor.x, actor.y, vx, vy, actor.heading, actor.cosine, actor.sine};
     return values[which];
 }
 
-// Writes the rows of a vehicle and of other actors.
-void show(Traffic *self, size_t row, const std::vector<size_t> &close, const char *features, const Scale *scales,
-          size_t columns, bool is_absolute, bool clips, double *cells) {
-    const Actor &observer = (*self->actors)[row];
-    for (size_t line = 0; line <= close.size(); line++) {
-        const Actor &actor = line ? (*self->actors)[close[line - 1]] : observer;
-        for (size_t column = 0; column < columns; column++) {
-            const int which = features[column];
-            double value = feature(actor, which);
-            if (line && !is_absolute && X <= which && which <= VY) {
-                value -= feature(observer, which);
-            }
-            const Scale &scale = scales[column];
-            if (scale.is_used) {
-                value = -1 + (value - scale.low) * 2 / scale.span;
-                value = clips ? clip(value, -1, 1) : value;
-            }
-            cells[line * columns + column] = value;
+// Whether highway-env describes an actor without an error: it does not describe the heading of an object that is no
+// vehicle.
+bool is_described(const Network *network, const Actor &actor, const char *features, size_t columns) {
+    return arrives(network, actor) && (actor.moves || !std::memchr(features, HEADING, columns));
+}
+
+// Writes the features of an actor, from the point of view of an observer if there is one.
+void describe(const Actor &actor, const Actor *observer, const char *features, const Scale *scales, size_t columns,
+              bool clips, double *cells) {
+    for (size_t column = 0; column < columns; column++) {
+        const int which = features[column];
+        double value = feature(actor, which);
+        if (observer && X <= which && which <= VY) {
+            value -= feature(*observer, which);
         }
+        const Scale &scale = scales[column];
+        if (scale.is_used) {
+            value = -1 + (value - scale.low) * 2 / scale.span;
+            value = clips ? clip(value, -1, 1) : value;
+        }
+        cells[column] = value;
     }
 }
 

@@ -7,88 +7,6 @@
 
 namespace {
 
-// --------------------------------------------------------------------------------------------------------------- Snapshot
-
-// The members that namespaces had at one time, to find out whether they still have them.
-struct Snapshot {
-    PyObject_HEAD
-    PyObject *spaces, *names, *values; // tuples: modules' dictionaries or classes, tuples of names, tuples of values
-};
-
-void snapshot_dealloc(Snapshot *self) {
-    Py_XDECREF(self->spaces);
-    Py_XDECREF(self->names);
-    Py_XDECREF(self->values);
-    PyTypeObject *type = Py_TYPE(self);
-    type->tp_free(reinterpret_cast<PyObject *>(self));
-    Py_DECREF(type);
-}
-
-// Snapshot(spaces, names, values)
-PyObject *snapshot_new(PyTypeObject *type, PyObject *args, PyObject *) {
-    PyObject *spaces, *names, *values;
-    if (!PyArg_ParseTuple(args, "O!O!O!", &PyTuple_Type, &spaces, &PyTuple_Type, &names, &PyTuple_Type, &values)) {
-        return nullptr;
-    }
-    const Py_ssize_t count = PyTuple_GET_SIZE(spaces);
-    bool usual = PyTuple_GET_SIZE(names) == count && PyTuple_GET_SIZE(values) == count;
-    for (Py_ssize_t at = 0; usual && at < count; at++) {
-        PyObject *space = PyTuple_GET_ITEM(spaces, at), *row = PyTuple_GET_ITEM(names, at);
-        usual = (PyDict_CheckExact(space) || PyType_Check(space)) && PyTuple_CheckExact(row) &&
-                PyTuple_CheckExact(PyTuple_GET_ITEM(values, at)) &&
-                PyTuple_GET_SIZE(row) == PyTuple_GET_SIZE(PyTuple_GET_ITEM(values, at));
-    }
-    if (!usual) {
-        return PyErr_Format(PyExc_TypeError, "each namespace needs as many names as values");
-    }
-    Snapshot *self = reinterpret_cast<Snapshot *>(type->tp_alloc(type, 0));
-    if (self) {
-        self->spaces = Py_NewRef(spaces);
-        self->names = Py_NewRef(names);
-        self->values = Py_NewRef(values);
-    }
-    return reinterpret_cast<PyObject *>(self);
-}
-
-// first_changed(sizes): the first namespace with another size or member; -1 if there is none.
-PyObject *snapshot_first_changed(Snapshot *self, PyObject *sizes) {
-    const Py_ssize_t count = PyTuple_GET_SIZE(self->spaces);
-    if (!PyList_CheckExact(sizes) || PyList_GET_SIZE(sizes) != count) {
-        return PyErr_Format(PyExc_TypeError, "one size is needed for each namespace");
-    }
-    for (Py_ssize_t at = 0; at < count; at++) {
-        PyObject *space = PyTuple_GET_ITEM(self->spaces, at), *names = PyTuple_GET_ITEM(self->names, at);
-        PyObject *values = PyTuple_GET_ITEM(self->values, at);
-        PyObject *members = PyDict_CheckExact(space) ? space : reinterpret_cast<PyTypeObject *>(space)->tp_dict;
-        bool same = PyDict_GET_SIZE(members) == PyLong_AsSsize_t(PyList_GET_ITEM(sizes, at));
-        for (Py_ssize_t which = 0; same && which < PyTuple_GET_SIZE(names); which++) {
-            PyObject *found = PyDict_GetItemWithError(members, PyTuple_GET_ITEM(names, which));
-            same = found == PyTuple_GET_ITEM(values, which);
-        }
-        if (PyErr_Occurred()) {
-            return nullptr;
-        }
-        if (!same) {
-            return PyLong_FromSsize_t(at);
-        }
-    }
-    return PyLong_FromLong(-1);
-}
-
-PyMethodDef snapshot_methods[] = {
-    {"first_changed", reinterpret_cast<PyCFunction>(snapshot_first_changed), METH_O, nullptr},
-    {nullptr, nullptr, 0, nullptr},
-};
-
-PyType_Slot snapshot_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(snapshot_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(snapshot_dealloc)},
-    {Py_tp_methods, snapshot_methods},
-    {Py_tp_doc, const_cast<char *>("The members of namespaces at one time.")},
-    {0, nullptr},
-};
-PyType_Spec snapshot_spec = {"_crashhunt_highway.Snapshot", sizeof(Snapshot), 0, Py_TPFLAGS_DEFAULT, snapshot_slots};
-
 // Calls a function for each member of a container until it returns false; returns whether it never did.
 template <typename Function> bool visit(PyObject *container, Function see) {
     if (PyList_CheckExact(container)) {
@@ -102,7 +20,9 @@ template <typename Function> bool visit(PyObject *container, Function see) {
     if (has_type(container, numpy_array)) {
         return true;
     }
-    PyObject *space = PyDict_CheckExact(container) ? Py_NewRef(container) : PyObject_GenericGetDict(container, nullptr);
+    PyObject *space = PyDict_CheckExact(container) ? Py_NewRef(container)
+                      : PyType_Check(container)    ? Py_NewRef(reinterpret_cast<PyTypeObject *>(container)->tp_dict)
+                                                   : PyObject_GenericGetDict(container, nullptr);
     PyObject *key, *value;
     Py_ssize_t at = 0;
     bool all = space != nullptr;
@@ -115,7 +35,8 @@ template <typename Function> bool visit(PyObject *container, Function see) {
 
 // --------------------------------------------------------------------------------------------------------------- Contents
 
-// The contents of containers at one time: dictionaries and lists, arrays of NumPy, and objects with their attributes.
+// The contents of containers at one time: dictionaries and lists, arrays of NumPy, classes, and objects with their
+// attributes.
 struct Contents {
     PyObject_HEAD
     PyObject *containers;                // a list

@@ -31,9 +31,7 @@ from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
 
 from crashhunt.highway.accelerator import (
-    Network,
     Onlooker,
-    TrafficFrame,
     _supported,
     _switch as accelerator,
     kind_of,
@@ -41,6 +39,8 @@ from crashhunt.highway.accelerator import (
     switch_off,
     switch_on,
 )
+from crashhunt.highway.accelerator._kernel_objects import KernelObjects
+from crashhunt.highway.accelerator._lane_network import Network
 
 assert HighwaySimulator
 IDS = sorted(name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("highway_env"))
@@ -422,9 +422,9 @@ def test_roads_of_earlier_episodes_are_forgotten():
 def test_a_vehicle_that_calls_itself_equal_to_another_is_not_taken_for_it():
     env = gymnasium.make("highway-fast-v0", disable_env_checker=True).unwrapped
     env.reset(seed=0)
-    frame = TrafficFrame(Network(env.road.network), env.road)
-    assert frame.is_of(env.road)
+    objects = KernelObjects(env.road, Network(env.road.network))
+    assert objects.is_of(env.road)
     other = copy.copy(env.road.vehicles[-1])
     other.__class__ = type("Equal", (type(other),), {"__eq__": lambda *_: True, "__hash__": object.__hash__})
     env.road.vehicles[-1] = other
-    assert not frame.is_of(env.road)
+    assert not objects.is_of(env.road)

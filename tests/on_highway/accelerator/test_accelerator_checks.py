@@ -24,14 +24,12 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 from small_roads import small_road
 
 from crashhunt.highway.accelerator import (
-    _frames,
     _kernel,
     _kernel_objects,
     _lane_network as _network,
     _roads,
     _supported,
     kind_of,
-    switch_off,
     switch_on,
 )
 
@@ -223,12 +221,25 @@ def test_connected_lanes_are_the_next_and_the_last_ones_with_their_offsets():
     assert lanes.connected_lanes(0) == [(0, 0.0), (2, 60.0), (3, -network.get_lane(("d", "a", 0)).length)]
 
 
-def test_position_counts_as_on_a_lane_as_in_highway_env():
+def test_neighbours_are_found_at_the_ends_and_sides_of_a_lane_as_in_highway_env():
     network = bent_network()
-    lane, lanes = network.get_lane(("a", "b", 0)), _network.Network(network)
-    for s in (-5.1, -5.0, 0.0, 64.9, 65.0, 65.1):
-        for r in (-3.1, -3.0, 0.0, 3.0, 3.1):
-            assert lanes.is_on(0, s, r) == lane.on_lane(np.array([s, r]), s, r, margin=1), (s, r)
+    lane = network.get_lane(("a", "b", 0))
+
+    def found():
+        place = Road(network, [IDMVehicle(None, lane.position(s, 0.0), 0.0) for s in (-9.0, 30.0, 80.0)])
+        for vehicle in place.vehicles:
+            vehicle.road, vehicle.lane_index, vehicle.lane = place, ("a", "b", 0), lane
+        observer, other, _ = place.vehicles
+        for s in (-5.1, -5.0, 0.0, 64.9, 65.0, 65.1):
+            for r in (-3.1, -3.0, 0.0, 3.0, 3.1):
+                other.position = lane.position(s, r)
+                neighbours = place.neighbour_vehicles(observer)
+                yield s, r, *map(place.vehicles.index, filter(None, neighbours))
+
+    slow = [*found()]
+    assert {len(one) for one in slow} == {2, 3}
+    assert switch_on() == ""
+    assert [*found()] == slow
 
 
 NUMBERS = {
@@ -379,7 +390,7 @@ def test_unusual_road_is_not_searched_by_the_kernel(change):
     assert _roads.look(place) is None
 
 
-def test_road_with_own_act_or_another_search_is_still_seen():
+def test_road_with_own_act_or_search_of_close_objects_is_still_known():
     assert switch_on() == ""
     place = small_road(*[IDMVehicle] * 3)
     place.act, place.step = place.act, place.step
@@ -388,11 +399,7 @@ def test_road_with_own_act_or_another_search_is_still_seen():
     assert _roads.is_known(place)
     place.__class__ = type("Own", (Road,), {"neighbour_vehicles": lambda *_: (None, None)})
     assert not _roads.is_known(place)
-    assert _roads.frame_of(place).plain
-    assert _roads.network_of(place).plain
-    switch_off()
-    assert not _roads.is_known(place)
-    assert _roads.frame_of(place) is _roads.network_of(place) is None
+    assert _roads.network_of(place) is None
 
 
 # The compiled kernel.
@@ -536,38 +543,6 @@ def test_one_example_of_each_class_shows_its_parameters_and_all_that_have_their_
 # Positions on a road.
 
 
-def frame_after(change):
-    """Whether a frame is still that of its road."""
-    place = small_road(*[IDMVehicle] * 3)
-    place.objects.append(Obstacle(place, [50.0, 4.0]))
-    frame = _frames.TrafficFrame(_network.Network(place.network), place)
-    assert frame.plain
-    assert frame.is_of(place)
-    change(place)
-    return frame.is_of(place)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda place: place.vehicles.reverse(),
-        lambda place: place.objects.clear(),
-        lambda place: place.vehicles.append(Vehicle(place, [90.0, 0.0])),
-        lambda place: place.vehicles[2].position.__setitem__(1, 1e-9),
-        lambda place: setattr(place.vehicles[1], "position", place.vehicles[1].position.astype(np.float32)),
-        lambda place: setattr(place, "neighbour_vehicles_connected_lanes", True),
-        lambda place: setattr(place.objects[0], "position", place.objects[0].position + 1.0),
-    ],
-)
-def test_frame_is_that_of_its_road_until_something_moves(change):
-    assert not frame_after(change)
-
-
-def test_frame_is_that_of_its_road_where_speeds_change_only():
-    assert frame_after(lambda place: setattr(place.vehicles[0], "speed", 3.0))
-    assert frame_after(lambda place: setattr(place.vehicles[0], "position", place.vehicles[0].position.copy()))
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -580,9 +555,13 @@ def test_frame_is_that_of_its_road_where_speeds_change_only():
     ],
 )
 def test_things_are_plain_where_each_has_its_own_usual_position(change):
+
+    def are_plain(things):
+        return _kernel_objects._are_plain(things, _supported.kinds_of(things))
+
     things = small_road(*[IDMVehicle] * 3).vehicles
-    assert _frames.are_plain(things)
+    assert are_plain(things)
     things[2].position = things[2].position.view(np.dtype(np.float64).newbyteorder("="))
-    assert _frames.are_plain(things)
+    assert are_plain(things)
     change(things)
-    assert not _frames.are_plain(things)
+    assert not are_plain(things)

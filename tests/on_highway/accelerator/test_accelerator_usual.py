@@ -34,7 +34,6 @@ from small_roads import small_road
 
 from crashhunt.highway.accelerator import (
     Onlooker,
-    _frames,
     _kernel_objects,
     _lane_network as _network,
     _substep_loop,
@@ -72,10 +71,10 @@ def originals_counted():
 
 @contextmanager
 def built():
-    """How often lanes, positions and vehicles are put into new objects of the accelerator."""
+    """How often lanes and vehicles are put into new objects of the accelerator."""
     counts = Counter()
     with pytest.MonkeyPatch.context() as patch:
-        for kind in (_frames.TrafficFrame, _network.Network, _kernel_objects.KernelObjects):
+        for kind in (_network.Network, _kernel_objects.KernelObjects):
             make = kind.__init__
             patch.setattr(
                 kind, "__init__", lambda *given, make=make: (counts.update([type(given[0]).__name__]), make(*given))[1]
@@ -92,9 +91,9 @@ USUAL = [
     ("highway-fast-v0", seeing(type="Kinematics", features=ALL, vehicles_count=2, absolute=True, clip=False), {}),
     ("highway-fast-v0", seeing(type="Kinematics", normalize=False, order="shuffled", see_behind=True), {}),
     ("highway-fast-v0", seeing(type="Kinematics", features_range={"x": [-90, 90], "vy": [np.float64(-2), 3]}), {}),
-    ("highway-fast-v0", seeing(type="Kinematics", features=["x", "lat_off", "cos_d"]), {"TrafficFrame": 1}),
-    ("highway-fast-v0", seeing(type="OccupancyGrid", features=["presence", "on_road"]), {"TrafficFrame": 1}),
-    ("highway-fast-v0", seeing(type="OccupancyGrid", as_image=True, clip=False), {"TrafficFrame": 1}),
+    ("highway-fast-v0", seeing(type="Kinematics", features=["x", "lat_off", "cos_d"]), {}),
+    ("highway-fast-v0", seeing(type="OccupancyGrid", features=["presence", "on_road"]), {}),
+    ("highway-fast-v0", seeing(type="OccupancyGrid", as_image=True, clip=False), {}),
     ("highway-fast-v0", seeing(type="TimeToCollision", horizon=4), {}),
     ("highway-fast-v0", {**SMALL, "action": {"type": "ContinuousAction"}}, {}),
     ("highway-fast-v0", {**SMALL, "action": {"type": "ContinuousAction", "dynamical": True}}, {}),
@@ -103,10 +102,10 @@ USUAL = [
     ("intersection-v0", {"initial_vehicle_count": 4, "spawn_probability": 0.0}, {}),
     ("merge-v0", {}, {}),
     ("roundabout-v0", {}, {}),
-    ("exit-v0", SMALL, {"TrafficFrame": 1}),
+    ("exit-v0", SMALL, {}),
     ("parking-v0", {"vehicles_count": 2}, {}),
     ("parking-v0", {}, {}),
-    ("racetrack-v0", {}, {"TrafficFrame": 1}),
+    ("racetrack-v0", {}, {}),
     ("two-way-v0", {}, {}),
     ("u-turn-v0", {}, {}),
 ]  # fmt: skip

@@ -409,22 +409,6 @@ def test_threads_do_not_disturb_each_other():
         assert list(pool.map(lambda seed: played(seed, 5), range(8))) == slow
 
 
-def test_second_thread_may_look_for_replaced_functions_while_the_first_one_begins_to():
-    assert not switch_on()
-    watch, found = _roads.watches["roads"], []
-
-    class Interrupted(list):
-        def __iter__(self):  # another thread runs whenever Python chooses, for example here
-            if watch._snapshot is not None:
-                with ThreadPoolExecutor(1) as other:
-                    found.append(other.submit(lambda: watch.intact).result())
-            return super().__iter__()
-
-    watch._places = Interrupted(watch._places)
-    assert watch.intact
-    assert all(found)
-
-
 def test_two_threads_may_discard_the_same_road(monkeypatch):
     class Discarded(dict):
         def __iter__(self):
