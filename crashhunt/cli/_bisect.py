@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import in_lines, one_line
-from crashhunt.cli._common import add_build, add_crash, add_json, answer, build_limit_s, opened_crash, say
+from crashhunt.cli._common import add_build, add_crash, add_json, build_limit_s, opened_crash
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def _bisect(options: Options, _words: list[str]) -> int:
     from crashhunt.corpus import bisect
 
     def show(revision: str, got: Got, why: str) -> None:
-        say(in_lines([f"{revision[:12]}  {got.replace('_', ' ')}{f': {why}' if why else ''}"]), as_json=options.json)
+        options.say(in_lines([f"{revision[:12]}  {got.replace('_', ' ')}{f': {why}' if why else ''}"]))
 
     def tell(caution: str) -> None:
         print(f"crashhunt: {caution}", file=sys.stderr, flush=True)
@@ -58,10 +58,10 @@ def _bisect(options: Options, _words: list[str]) -> int:
                 build=options.build, build_limit_s=build_limit_s(options),
             )  # fmt: skip
         except KeyboardInterrupt:
-            say("Interrupted: the commit is not known yet. The same command begins again.", as_json=options.json)
+            options.say("Interrupted: the commit is not known yet. The same command begins again.")
             raise
     text = f"it is one of {', '.join(one[:12] for one in found.candidates)}"
     if found.commit:
         text = one_line(f"{found.commit[:12]} is the first in which it crashes: {found.subject}")
-    answer(options, text, found.to_json())
+    options.answer(text, found.to_json())
     return 0 if found.commit else 1

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, count_of
-from crashhunt.cli._common import Commands, Options, add_json, say
+from crashhunt.cli._common import Commands, Options, add_json
 
 if TYPE_CHECKING:
     from crashhunt.hunts import Checked
@@ -45,18 +44,14 @@ def _check(options: Options, _words: list[str]) -> int:
             f"--salvage takes one hunt, but {len(found)} hunts were found", fix="give the directory of one hunt"
         )
     for each in found:
-        say(_describe(each), as_json=options.json)
+        options.say(_describe(each))
     saved = None
     if options.salvage is not None:
         saved = salvage(found[0], options.salvage)
         counts = f"{count_of(saved['trials'], 'trial')} and {count_of(saved['crashes'], 'crash')}"
-        say(
-            f"{counts} are in {command_line(options.salvage)}; resume the hunt there with crashhunt run",
-            as_json=options.json,
-        )
+        options.say(f"{counts} are in {command_line(options.salvage)}; resume the hunt there with crashhunt run")
     fine = all(each.fine for each in found)
-    if options.json:
-        print(json.dumps({"fine": fine, "hunts": [each.to_json() for each in found], "salvaged": saved}))
+    options.print_json({"fine": fine, "hunts": [each.to_json() for each in found], "salvaged": saved})
     return 0 if fine else 1
 
 

@@ -47,8 +47,25 @@ OUTPUT_CLOSED: Final = 141
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
-Options: TypeAlias = argparse.Namespace
-"""The values of a command's arguments."""
+
+class Options(argparse.Namespace):
+    """The values of a command's arguments, and the ways to print its answer."""
+
+    json: bool  # whether to print one JSON object to stdout, and all other text to stderr
+
+    def say(self, text: str, *, beside: bool = False) -> None:
+        """Print a text for the user; a text ``beside`` the answer always goes to stderr."""
+        print(visible(text), file=sys.stderr if self.json or beside else sys.stdout)
+
+    def print_json(self, data: object) -> None:
+        """Print data as one JSON object if the user requested JSON."""
+        if self.json:
+            print(json.dumps(data))
+
+    def answer(self, text: str, data: object) -> None:
+        """Print the answer of a command: the text for the user, and with ``--json`` the data as one JSON object."""
+        self.say(text)
+        self.print_json(data)
 
 
 class Parser(argparse.ArgumentParser):
@@ -75,7 +92,7 @@ class Parser(argparse.ArgumentParser):
                 fix = f"see {self.prog} --help; if it is a file or folder, write ./{word}"
                 raise UsageError(f"there is no option {word!r}", fix=fix)
             before = word
-        found, rest = super().parse_known_args(args, namespace)
+        found, rest = super().parse_known_args(args, Options() if namespace is None else namespace)
         ends_in_list = next(
             (one for one in reversed(self._actions) if not one.option_strings and one.nargs == "*"), None
         )
@@ -263,18 +280,6 @@ def chosen_runs(directory: Path, runs: list[str]) -> dict[Path, str]:
     return {hunt: name for hunt, name in names.items() if not runs or {name, name.partition("/")[0]} & set(runs)}
 
 
-def say(text: str, *, as_json: bool) -> None:
-    """Print a text for the user."""
-    print(visible(text), file=sys.stderr if as_json else sys.stdout)
-
-
-def answer(options: argparse.Namespace, text: str, data: object) -> None:
-    """Print the answer of a command: the text for the user, and with ``--json`` the data as one JSON object."""
-    say(text, as_json=options.json)
-    if options.json:
-        print(json.dumps(data))
-
-
 def pairs(words: list[str], option: str, *, named: bool = True) -> dict[str, str]:
     """Split repeated ``NAME=VALUE`` options.
 
@@ -445,7 +450,7 @@ def add_ci_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) -> None:
+def tell(options: Options, summary: str, annotations: Sequence[str]) -> None:
     """Write the summary and print the annotations, if the user requested them.
 
     Raises:
@@ -460,7 +465,7 @@ def tell(options: argparse.Namespace, summary: str, annotations: Sequence[str]) 
             raise cannot_write(options.summary, error) from error
     if options.annotate:
         for line in annotations:
-            say(line, as_json=options.json)
+            options.say(line)
 
 
 # The options of a hunt on the command line, as the list has them.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import Commands, Options, add_json, say
+from crashhunt.cli._common import Commands, Options, add_json
 from crashhunt.plans import RATE_PERS
 
 
@@ -45,15 +44,14 @@ def _compare(options: Options, _words: list[str]) -> int:
             if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:
-                say(f"{command_line(hunt)} has not begun, and is excluded", as_json=True)
+                options.say(f"{command_line(hunt)} has not begun, and is excluded", beside=True)
     found = compare(*hunts, per=options.per)
     if options.csv:
         found.write_csv(sys.stdout)
     else:
-        say(describe_comparison(found), as_json=options.json)
+        options.say(describe_comparison(found))
     if options.html is not None:
         comparison_page(found, options.html)
-        say(f"{command_line(options.html)} has the plots", as_json=options.json or options.csv)
-    if options.json:
-        print(json.dumps(found.to_json()))
+        options.say(f"{command_line(options.html)} has the plots", beside=options.csv)
+    options.print_json(found.to_json())
     return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +17,6 @@ from crashhunt.cli._common import (
     crash_id,
     opened_crash,
     refuse_below,
-    say,
     shown_progress,
     tell,
 )
@@ -113,24 +111,22 @@ def _add(options: Options, _words: list[str]) -> int:
             data = added.case.to_json()
             answers.append({**data, "new": added.new})
             log = added.case.kind_of_log()
-            say(_added(data["path"], data["bytes"], log=log, new=added.new), as_json=options.json)
+            options.say(_added(data["path"], data["bytes"], log=log, new=added.new))
             if added.changed:
-                say(in_lines([f"  expect is now {added.case.expect}{_note(added.case.note)}"]), as_json=options.json)
+                options.say(in_lines([f"  expect is now {added.case.expect}{_note(added.case.note)}"]))
             if added.judged:
-                say("  its causes are in the corpus now", as_json=options.json)
+                options.say("  its causes are in the corpus now")
             others = (
                 0 if crash or archive is not None or (path / layout.CRASH).is_file() else len(list_bundles(path)) - 1
             )
             if others > 0:
-                say(
+                options.say(
                     f"  one of {others + 1} crashes; to add another one, give --crash ID; to add all of them, give "
-                    f"{command_line(path)}/crashes/*",
-                    as_json=options.json,
+                    f"{command_line(path)}/crashes/*"
                 )
             if bundle.confirmed is False:
-                say("  warning: it is flaky, so that it may be fixed by luck", as_json=options.json)
-    if options.json:
-        print(json.dumps({"cases": answers}))
+                options.say("  warning: it is flaky, so that it may be fixed by luck")
+    options.print_json({"cases": answers})
     return 0
 
 
@@ -157,10 +153,9 @@ def _run(options: Options, _words: list[str]) -> int:
             cases, parallel=options.parallel, keep=options.keep, watch=watch, stopped=lambda: bool(asked),
             trusted=True,
         )  # fmt: skip
-    say(_summary_of(reports, len(cases)), as_json=options.json)
+    options.say(_summary_of(reports, len(cases)))
     tell(options, corpus_summary(reports), corpus_annotations(reports))
-    if options.json:
-        print(json.dumps({"cases": [report.to_json() for report in reports]}))
+    options.print_json({"cases": [report.to_json() for report in reports]})
     if len(reports) < len(cases):
         return INTERRUPTED
     return 0 if all(report.ok for report in reports) else 1
@@ -213,7 +208,6 @@ def _list(options: Options, _words: list[str]) -> int:
     cases = [read_case(path) for path in find_cases(options.places)]
     for case in cases:
         note = f"  ({case.note})" if case.note else ""
-        say(in_lines([f"{command_line(case.path)}  {case.expect}  {case.crash}{note}"]), as_json=options.json)
-    if options.json:
-        print(json.dumps({"cases": [case.to_json() for case in cases]}))
+        options.say(in_lines([f"{command_line(case.path)}  {case.expect}  {case.crash}{note}"]))
+    options.print_json({"cases": [case.to_json() for case in cases]})
     return 0

@@ -18,7 +18,6 @@ from crashhunt.cli._common import (
     add_json,
     integer,
     refuse_below,
-    say,
     tell,
 )
 from crashhunt.cli._trust import add_trust, check_trust
@@ -85,19 +84,19 @@ def _crashes(options: Options, _words: list[str]) -> int:
     causes, interrupted = (None, False) if options.by_cause is None else _divide_types(options, found.groups)
     comparison = _Comparison(found, cases, causes)
     known = comparison.known
-    say(describe_groups(found.groups, known), as_json=options.json)
+    options.say(describe_groups(found.groups, known))
     versions = crashes_by_version(hunts, found.groups)
     for line in describe_types_by_version(versions):
-        say(line, as_json=options.json)
+        options.say(line)
     if causes is not None:
-        say(describe_causes(found.groups, causes), as_json=options.json)
+        options.say(describe_causes(found.groups, causes))
     for why in found.left_out:
-        say(f"skipped: {why}", as_json=True)
+        options.say(f"skipped: {why}", beside=True)
     for line in comparison.lines():
-        say(line, as_json=options.json)
+        options.say(line)
     notes = [(hunt, note) for hunt in hunts for note in read_notes(hunt)]
     for line in [f"{hunt}: {describe_note(note, whole=False)}" for hunt, note in notes]:
-        say(line, as_json=options.json)
+        options.say(line)
     _print_groups(options, found.groups, known)
     if options.json:
         groups = comparison.to_json()
@@ -111,7 +110,7 @@ def _crashes(options: Options, _words: list[str]) -> int:
         noted = {"notes": [{"hunt": str(hunt), **note.to_json()} for hunt, note in notes]} if notes else {}
         print(json.dumps({"groups": groups, **by_cause, "left_out": list(found.left_out), **apart, **noted}))
     if interrupted:
-        say("Interrupted: some causes are not known yet. Run the same command to resume.", as_json=options.json)
+        options.say("Interrupted: some causes are not known yet. Run the same command to resume.")
     if interrupted:
         return INTERRUPTED
     return THE_ANSWER_IS_NO if options.fail_on_new and comparison.has_news else DONE
@@ -186,8 +185,8 @@ class _Comparison:
         ]
 
 
-def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) -> tuple[JsonObject, bool]:
-    """Print the crash types of all hunts below a directory, compared with a corpus.
+def compare_with_corpus(options: Options, cases: list[Case]) -> tuple[JsonObject, bool]:
+    """Print the crash types of all hunts below the directory of a command, compared with a corpus.
 
     Returns:
         The types in the form that ``crashes --json`` prints, and whether a type is new or cannot be compared.
@@ -196,12 +195,12 @@ def compare_with_corpus(directory: Path, cases: list[Case], *, as_json: bool) ->
     from crashhunt.report import describe_groups
     from crashhunt.results import dropped_crashes, find_hunts
 
-    hunts = find_hunts(directory)
+    hunts = find_hunts(options.directory)
     found = group_crashes((bundle for hunt in hunts for bundle in list_bundles(hunt)), dropped_crashes(hunts))
     comparison = _Comparison(found, cases)
-    say(describe_groups(found.groups, comparison.known), as_json=as_json)
+    options.say(describe_groups(found.groups, comparison.known))
     for line in (*(f"skipped: {why}" for why in found.left_out), *comparison.lines()):
-        say(line, as_json=as_json)
+        options.say(line)
     return {"groups": comparison.to_json(), "not_compared": list(found.left_out)}, comparison.has_news
 
 

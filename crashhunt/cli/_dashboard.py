@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, Commands, Options, add_json, integer, say
+from crashhunt.cli._common import DONE, Commands, Options, add_json, integer
 
 if TYPE_CHECKING:
     from crashhunt.dashboard import Address
@@ -57,7 +57,7 @@ def _dashboard(options: Options, _words: list[str]) -> int:
         if options.json:
             found = {"url": address.url, "host": address.host, "port": address.port, "token": address.token}
             print(json.dumps(found), flush=True)
-        say(f"{address.url}\nCtrl-C ends the dashboard.", as_json=options.json)
+        options.say(f"{address.url}\nCtrl-C ends the dashboard.")
         sys.stdout.flush()
 
     with suppress(KeyboardInterrupt):  # the usual end

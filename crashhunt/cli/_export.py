@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import Commands, Options, add_crash, add_json, answer, opened_crash, shown_progress
+from crashhunt.cli._common import Commands, Options, add_crash, add_json, opened_crash, shown_progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -72,7 +72,7 @@ def _export(options: Options, _words: list[str]) -> int:
     ):
         size = export_crash(bundle, options.file, watch=watch)
     text = f"{bundle.id} is in {command_line(options.file)} ({size / 1e6:.2f} MB)"
-    answer(options, text, {"crash": bundle.id, "file": str(options.file), "bytes": size})
+    options.answer(text, {"crash": bundle.id, "file": str(options.file), "bytes": size})
     return 0
 
 
@@ -95,5 +95,5 @@ def _convert(options: Options) -> int:
     names = " and ".join(map(command_line, files))
     text = f"{bundle.id} is in {names} ({size / 1e6:.2f} MB), for {options.form}"
     facts = {"crash": bundle.id, "file": str(options.file), "bytes": size, "as": options.form, "actors": actors}
-    answer(options, text, facts)
+    options.answer(text, facts)
     return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import defaultdict
@@ -29,7 +28,6 @@ from crashhunt.cli._common import (
     integer,
     make_console,
     number,
-    say,
     tell,
 )
 from crashhunt.cli._trust import add_trust
@@ -151,7 +149,7 @@ def _gate(options: Options, words: list[str]) -> int:
 
     with _watched(as_json=options.json) as watch:
         found = gate.run(options.keep, watch, tell_user)
-    say(describe_gate(found), as_json=options.json)
+    options.say(describe_gate(found))
     summary = gate_summary(found)
     if options.markdown is not None:
         with output_file(options.markdown) as temporary:
@@ -159,8 +157,7 @@ def _gate(options: Options, words: list[str]) -> int:
     if options.junit is not None:
         write_gate_junit(found, options.junit)
     tell(options, summary, gate_annotations(found))
-    if options.json:
-        print(json.dumps(found.to_json()))
+    options.print_json(found.to_json())
     return _exit_code(found)
 
 

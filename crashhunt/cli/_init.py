@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import DONE, Commands, Options, add_json, answer
+from crashhunt.cli._common import DONE, Commands, Options, add_json
 
 if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
@@ -97,7 +97,7 @@ def _init(options: Options, _words: list[str]) -> int:
     finally:
         tell("")
     lines = [f"made {command_line(options.directory)}", "", *describe_place(made), "", "Next:"]
-    answer(options, "\n".join([*lines, *(f"  {command}" for command in made.commands)]), made.to_json())
+    options.answer("\n".join([*lines, *(f"  {command}" for command in made.commands)]), made.to_json())
     return DONE
 
 
@@ -120,7 +120,7 @@ def _init_from_parameters(options: Options) -> int:
         "All other arguments of the scenario keep their values.", "",
         "Next:", f"  {run}",
     ]  # fmt: skip
-    answer(options, "\n".join(lines), made.to_json())
+    options.answer("\n".join(lines), made.to_json())
     return DONE
 
 

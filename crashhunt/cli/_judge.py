@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from crashhunt.cli._common import (
     add_parallel,
     integer,
     opened_crash,
-    say,
     shown_progress,
 )
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
@@ -89,8 +87,7 @@ def _judge(options: Options, _words: list[str]) -> int:
                         bundle, archive, options,
                     )
                 )  # fmt: skip
-    if options.json:
-        print(json.dumps({"judged": answers}))
+    options.print_json({"judged": answers})
     return INTERRUPTED if stops else DONE
 
 
@@ -139,5 +136,5 @@ def _judge_one(
     assert found is not None
     story = Story(bundle)
     lines = [f"{bundle.id}: {bundle.result.summary}", *(f"  {line}" for line in story.about_judgement())]
-    say("\n".join(lines), as_json=options.json)
+    options.say("\n".join(lines))
     return {"crash": bundle.id, **found.to_json()}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import DONE, Commands, CrashId, Options, add_json, hunt_of_bundle, integer, opened_hunt, say
+from crashhunt.cli._common import DONE, Commands, CrashId, Options, add_json, hunt_of_bundle, integer, opened_hunt
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,16 +68,15 @@ def _note(options: Options, _words: list[str]) -> int:
         words = options.find.split()
         found = [(place, note) for place, note in known if note.matches(words)]
         for place, note in found:
-            say(f"{place}: {describe_note(note)}", as_json=options.json)
+            options.say(f"{place}: {describe_note(note)}")
         if not found:
-            say(_nothing_found(options.find, [note for _, note in known]), as_json=options.json)
-        if options.json:
-            print(json.dumps({"notes": [{"hunt": place, **note.to_json()} for place, note in found]}))
+            options.say(_nothing_found(options.find, [note for _, note in known]))
+        options.print_json({"notes": [{"hunt": place, **note.to_json()} for place, note in found]})
         return DONE
     hunt, crash = _subject(options)
     changed = _removed(options, hunt, crash) if options.remove else [_added(options, hunt, crash, tags)]
     for note in changed:
-        say(f"{'removed' if options.remove else 'noted'}: {describe_note(note)}", as_json=options.json)
+        options.say(f"{'removed' if options.remove else 'noted'}: {describe_note(note)}")
     if options.json:
         key = "removed" if options.remove else "added"
         print(json.dumps({key: [{"hunt": str(hunt), **note.to_json()} for note in changed]}))

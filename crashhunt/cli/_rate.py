@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, Commands, GivenOnce, Options, add_json, number, say
+from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, Commands, GivenOnce, Options, add_json, number
 from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:
@@ -82,12 +81,11 @@ def _rate(options: Options, _words: list[str]) -> int:
     if options.csv:
         write_rates_csv(rates, sys.stdout)
     else:
-        say(describe_rates(rates), as_json=options.json)
+        options.say(describe_rates(rates))
     if options.html is not None:
         rates_page(rates, options.html)
-        say(f"{command_line(options.html)} has the page", as_json=options.json or options.csv)
-    if options.json:
-        print(json.dumps({"rates": [rate.to_json() for rate in rates]}))
+        options.say(f"{command_line(options.html)} has the page", beside=options.csv)
+    options.print_json({"rates": [rate.to_json() for rate in rates]})
     return DONE if bar is None else exit_code_of(rate.verdict for rate in rates)
 
 

@@ -24,7 +24,6 @@ from crashhunt.cli._common import (
     number,
     opened_crash,
     pairs,
-    say,
     shown_progress,
 )
 from crashhunt.cli._trust import add_trust, run_trusted
@@ -357,7 +356,7 @@ def _replay(options: Options, _words: list[str]) -> int:
             good = good and set(report.verdicts) == {options.expect}
     written = write_films(options, shots, film) if film is not None else {}
     for path, count in written.items():
-        say(f"{command_line(path)} has {count} pictures", as_json=options.json)
+        options.say(f"{command_line(path)} has {count} pictures")
     if options.json:
         data: dict[str, object] = dict(answers[0]) if len(answers) == 1 else {"crashes": answers}
         print(json.dumps(data | ({"written": written} if film is not None else {})))
@@ -378,12 +377,11 @@ def _replay_often(options: Options, chosen: ReplayOptions) -> int:
         try:
             report, answer = run_trusted(run, bundle, archive, options)
         except StoppedError:
-            say(f"Interrupted: none of {chosen.times} replays finished.", as_json=options.json)
+            options.say(f"Interrupted: none of {chosen.times} replays finished.")
             return INTERRUPTED
     if report.times < chosen.times:
-        say(f"Interrupted: {report.times} of {chosen.times} replays finished.", as_json=options.json)
-    if options.json:
-        print(json.dumps(answer))
+        options.say(f"Interrupted: {report.times} of {chosen.times} replays finished.")
+    options.print_json(answer)
     if report.times < chosen.times:
         return INTERRUPTED
     return 0 if set(report.verdicts) == {options.expect} else 1
@@ -440,9 +438,9 @@ def _replay_one(
         near = most_dangerous(bundle.recording()) if bundle.is_near_miss else None
         other = partner(bundle.result) if near is None or near.agent != bundle.driver else near.other
         table = steps_table(report.recording, fields, bundle.driver, other)
-        say("\n".join([*format_table(table), ""]), as_json=options.json)
+        options.say("\n".join([*format_table(table), ""]))
         answer["table"] = table
-    say(describe_replay(report), as_json=options.json)
+    options.say(describe_replay(report))
     return report, answer
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import HuntDirectoryError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, refuse_below, say, shown_progress
+from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, refuse_below, shown_progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,10 +70,7 @@ def _report(options: Options, _words: list[str]) -> int:
             )
     also = f", and the {len(near)} most critical of {len(near_misses)} near misses" if near else ""
     count = f"{len(shown)} of {found.tally.found} crashes"
-    say(
-        f"{command_line(target)} ({size / 1e6:.1f} MB) shows {count}{_shown_crashes(found, shown)}{also}",
-        as_json=options.json,
-    )
+    options.say(f"{command_line(target)} ({size / 1e6:.1f} MB) shows {count}{_shown_crashes(found, shown)}{also}")
     if options.json:
         data: dict[str, object] = {
             "file": str(target),

@@ -108,8 +108,7 @@ def _run(options: Options, words: list[str]) -> int:
         watcher.tell_notes()  # where there was nothing to run
     described = describe_hunt(report, has_dashboard=console.is_terminal and has_dashboard())
     console.print(described, soft_wrap=True)
-    if options.json:
-        print(json.dumps(report.to_json()))
+    options.print_json(report.to_json())
     if report.stopped_because == "no_valid_trial":
         return NO_VALID_TRIAL
     if report.stopped_because == "interrupted":

@@ -19,9 +19,7 @@ from crashhunt.cli._common import (
     add_json,
     add_options,
     add_parallel,
-    answer,
     chosen_options,
-    say,
 )
 from crashhunt.cli._suite import run_with_trust, states_watcher
 from crashhunt.cli._trust import add_trust
@@ -80,8 +78,7 @@ def _scorecard(options: Options, _words: list[str]) -> int:
             options,
         )  # fmt: skip
     except KeyboardInterrupt:
-        say(f"Interrupted. Run the same command to resume; {command_line(directory)} has the cases that ran.",
-            as_json=options.json)  # fmt: skip
+        options.say(f"Interrupted. Run the same command to resume; {command_line(directory)} has the cases that ran.")
         raise
     finally:
         finish()
@@ -93,7 +90,7 @@ def _scorecard(options: Options, _words: list[str]) -> int:
     ):
         with whole_file(directory / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    answer(options, describe_scorecard(card, str(directory)), card)
+    options.answer(describe_scorecard(card, str(directory)), card)
     return DONE if found.is_complete else NO_ANSWER
 
 

@@ -11,7 +11,6 @@ from crashhunt.cli._common import (
     add_crash,
     add_json,
     add_parallel,
-    answer,
     duration_s,
     integer,
     opened_crash,
@@ -84,7 +83,7 @@ def _shrink(options: Options, _words: list[str]) -> int:
                 )  # fmt: skip
 
         found = run_trusted(run, bundle, None, options)
-    answer(options, _summary_of(found), found.to_json())
+    options.answer(_summary_of(found), found.to_json())
     if found.ended == "interrupted":
         return INTERRUPTED
     return 1 if found.verdict == "not_reproduced" else 0

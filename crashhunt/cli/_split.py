@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from crashhunt.cli._common import DONE, Commands, Options, add_json, say
+from crashhunt.cli._common import DONE, Commands, Options, add_json
 
 _PARTS = ("training", "test")
 
@@ -48,7 +47,6 @@ def _split(options: Options, _words: list[str]) -> int:
         if found.faults:
             lines.append(f"omitted: {found.faults} software faults")
     if lines:
-        say("\n".join(lines), as_json=options.json)
-    if options.json:
-        print(json.dumps(found.to_json()))
+        options.say("\n".join(lines))
+    options.print_json(found.to_json())
     return DONE

@@ -18,7 +18,6 @@ from crashhunt.cli._common import (
     chosen_runs,
     integer,
     pairs,
-    say,
 )
 from crashhunt.cli._crashes import add_known, checked_cases, compare_with_corpus
 from crashhunt.cli._status import show_states, state_words, states_console, states_table
@@ -107,7 +106,7 @@ def _run(options: Options, _words: list[str]) -> int:
     suite = Suite.read(options.file)
     cases = checked_cases(options)
     if options.directory.is_dir() and (kept := describe_finished(options.directory)):
-        say(kept, as_json=options.json)
+        options.say(kept)
     watch, finish = states_watcher(as_json=options.json)
     try:
         machine = chosen_of_machine(options)
@@ -122,13 +121,13 @@ def _run(options: Options, _words: list[str]) -> int:
         _print_states(
             [hunt_state(hunt) for hunt in find_hunts(options.directory)], options.directory, as_json=options.json
         )
-        say("Interrupted. Run the same command to resume.", as_json=options.json)
+        options.say("Interrupted. Run the same command to resume.")
         raise
     finally:
         finish()
     if cases is None:
         return _print_states(states, options.directory, as_json=options.json)
-    types, has_news = compare_with_corpus(options.directory, cases, as_json=options.json)
+    types, has_news = compare_with_corpus(options, cases)
     code = _print_states(states, options.directory, as_json=options.json, more=types)
     return THE_ANSWER_IS_NO if options.fail_on_new and has_news else code
 
@@ -156,12 +155,12 @@ def _rerun(options: Options, _words: list[str]) -> int:
         )  # fmt: skip
     except KeyboardInterrupt:
         resume = command_line("crashhunt", "rerun", options.to or options.directory)
-        say(f"Interrupted. {resume} resumes the hunts that have begun.", as_json=options.json)
+        options.say(f"Interrupted. {resume} resumes the hunts that have begun.")
         raise
     finally:
         finish()
     for place in replaced:
-        say(f"replaced: {command_line(place)}", as_json=options.json)
+        options.say(f"replaced: {command_line(place)}")
     return _print_states(
         states,
         options.to or options.directory,

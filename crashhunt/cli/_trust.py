@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.text import command_line, near_path, one_line
-from crashhunt.cli._common import Commands, Options, Parser, add_json, say
+from crashhunt.cli._common import Commands, Options, Parser, add_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,22 +50,20 @@ def _trust(options: Options, _words: list[str]) -> int:
     if options.remove:
         removed = remove_trusted(options.remove)
         for origin in removed:
-            say(f"no longer trusted: {_line(origin)}", as_json=options.json)
-        if options.json:
-            print(json.dumps({"removed": [origin.to_json() for origin in removed]}))
+            options.say(f"no longer trusted: {_line(origin)}")
+        options.print_json({"removed": [origin.to_json() for origin in removed]})
         return 0
     if options.places:
         found = {origin.fingerprint: origin for place in options.places for origin in _trust_place(place)}
         for origin in found.values():
-            say(f"trusted: {_line(origin)}", as_json=options.json)
+            options.say(f"trusted: {_line(origin)}")
     else:
         found = {origin.fingerprint: origin for origin in list_trusted()}
         for origin in found.values():
-            say(_line(origin), as_json=options.json)
+            options.say(_line(origin))
         if not found:
-            say("You trust no code besides what you made on this machine.", as_json=options.json)
-    if options.json:
-        print(json.dumps({"trusted": [origin.to_json() for origin in found.values()]}))
+            options.say("You trust no code besides what you made on this machine.")
+    options.print_json({"trusted": [origin.to_json() for origin in found.values()]})
     return 0
 
 

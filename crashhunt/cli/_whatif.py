@@ -13,7 +13,6 @@ from crashhunt.cli._common import (
     add_crash,
     add_json,
     add_parallel,
-    answer,
     duration_s,
     integer,
     number,
@@ -137,5 +136,5 @@ def _whatif(options: Options, _words: list[str]) -> int:
                 )
 
         counts = run_trusted(run, bundle, archive, options)
-    answer(options, "\n".join(counts.lines()), counts.to_json())
+    options.answer("\n".join(counts.lines()), counts.to_json())
     return INTERRUPTED if stops else DONE

@@ -117,9 +117,9 @@ def test_pairs_are_divided_at_the_first_sign(words, named, found):
 
 
 def test_text_goes_to_stderr_if_json_is_printed(capsys):
-    _common.say("plain", as_json=False)
-    _common.say("beside", as_json=True)
-    assert capsys.readouterr() == ("plain\n", "beside\n")
+    _common.Options(json=False).answer("plain", {})
+    _common.Options(json=True).answer("beside", {"answer": 1})
+    assert capsys.readouterr() == ('plain\n{"answer": 1}\n', "beside\n")
 
 
 def test_runs_of_a_suite_are_chosen_by_hunt_or_number(tmp_path, monkeypatch):
@@ -239,15 +239,15 @@ def test_progress_is_shown_on_a_terminal_if_no_json_is_printed(monkeypatch):
 def test_summary_is_added_to_its_file_and_annotations_are_printed_if_asked_for(tmp_path, capsys):
     place = tmp_path / "summary.md"
     for options in (
-        argparse.Namespace(summary=place, annotate=True, json=False),
-        argparse.Namespace(summary=place, annotate=False, json=False),
-        argparse.Namespace(summary=None, annotate=True, json=True),
+        _common.Options(summary=place, annotate=True, json=False),
+        _common.Options(summary=place, annotate=False, json=False),
+        _common.Options(summary=None, annotate=True, json=True),
     ):
         _common.tell(options, "# yes", ["::one", "::two"])
     assert place.read_text() == "# yes\n# yes\n"
     assert capsys.readouterr() == ("::one\n::two\n", "::one\n::two\n")
     with pytest.raises(HuntDirectoryError, match="cannot be written"):
-        _common.tell(argparse.Namespace(summary=tmp_path, annotate=False, json=False), "", [])
+        _common.tell(_common.Options(summary=tmp_path, annotate=False, json=False), "", [])
 
 
 def hunt_parser(names=()):
