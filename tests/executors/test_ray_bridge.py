@@ -73,8 +73,8 @@ class Made:
             return answer
         if what == "differs":
             self.ready[answer] = self.differing.get(actor.machine, "")
-        elif what in ("begin", "deliver"):
-            self.ready[answer] = "ready" if what == "deliver" else "lacks"
+        elif what == "begin":
+            self.ready[answer] = "ready"
         return answer
 
     def order(self, actor, what, *arguments):

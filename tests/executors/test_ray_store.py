@@ -21,9 +21,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors.ray import RayExecutor
-from crashhunt.executors.ray._code_archive import CodeArchive, Folder, Store, settings_in, unpack
+from crashhunt.executors.ray._code_archive import CodeArchive, Folder, settings_in, unpack
 from crashhunt.executors.ray._node_actor import Site, code_digest
-from crashhunt.executors.ray._node_scheduler import Node, NodeScheduler, Trial, shares
+from crashhunt.executors.ray._node_scheduler import Node, NodeScheduler, Trial
 from crashhunt.executors.ray._node_worker import Work
 from crashhunt.recording import BlackBox, Tag, read_black_box
 from crashhunt.scenario import Scenario
@@ -126,22 +126,6 @@ def test_a_parcel_that_is_not_what_was_sent_is_refused(settings, tmp_path):
             assert (tmp_path / f"flipped {at}" / "code" / "0" / "mine" / "agent.py").read_text() == "x = 1"
 
 
-def test_what_is_kept_is_bounded_and_what_is_damaged_is_let_go(settings, tmp_path):
-    store = Store(tmp_path / "store", kept_bytes=250)
-    for number, name in enumerate("abc"):
-        store.keep(name, bytes(100))
-        os.utime(tmp_path / "store" / f"{name}.zip", (number, number))
-    assert store.find("a") is None, "the one that was used longest ago"
-    assert store.find("b") == bytes(100)  # which is use
-    store.keep("d", bytes(100))
-    assert store.find("c") is None
-    store.keep("large", bytes(1000))
-    assert store.find("large") == bytes(1000), "what is in use is kept, whatever its size"
-    store.drop("large")
-    store.drop("large")  # which is gone
-    assert store.find("large") is None
-
-
 def test_a_folder_that_is_being_made_is_not_taken_for_one_that_was_left(tmp_path, monkeypatch):
     """Two hunts begin at once: one looks for what was left while the other one makes its folder, whenever that is."""
     (tmp_path / "store").mkdir()
@@ -220,9 +204,8 @@ def work(settings, tmp_path, monkeypatch):
         yield lambda *ending: make(*([result(*one)] for one in ending), slots=4)
 
 
-def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, monkeypatch):
+def test_a_node_prepares_only_with_code_that_arrived_whole(settings, tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
     monkeypatch.setattr(
         "crashhunt.executors.ray._node_worker.PoolExecutor", lambda given, **more: made.append((given, more)) or Pool()
@@ -230,21 +213,15 @@ def test_a_node_asks_for_code_once_and_keeps_what_is_whole(settings, tmp_path, m
     parcel = CodeArchive.of(settings)
     job = {"settings": settings.to_json(), "digest": parcel.digest(), "folders": parcel.folders,
            "home": "", "slots": 4}  # fmt: skip
-    first, second, third = (Work(job) for _ in range(3))
-    assert first.begin() == "lacks"
-    assert first.deliver(parcel.packed()[:-30]) == "the parcel was damaged on its way"
+    node = Work(job)
+    assert node.begin(parcel.packed()[:-30]) == "the parcel was damaged on its way"
     assert made == []
-    assert first.deliver(parcel.packed()) == "ready"
-    assert second.begin() == "ready"
-    (given, more), _ = made
+    assert node.begin(parcel.packed()) == "ready"
+    [(given, more)] = made
     assert more == {"parallel": 4}
     assert (Path(given.code[0]) / "mine" / "agent.py").read_text() == "x = 1"
     assert given.scratch != settings.scratch
-    first._store.keep(parcel.digest(), b"damaged later")
-    assert third.begin() == "lacks"
-    assert third._store.find(parcel.digest()) is None
-    for one in (first, second, third):
-        one.close()
+    node.close()
 
 
 def test_whatever_an_agent_has_put_where_its_trial_is_recorded_the_node_continues(work):
@@ -287,28 +264,6 @@ def test_a_folder_in_which_ray_cannot_work_is_not_used(usual, monkeypatch):
     folder = Folder()
     folder.remove()
     assert folder.path.parent == Path("/tmp")
-
-
-def test_a_folder_of_another_is_not_used(tmp_path):
-    (tmp_path / "open").mkdir(mode=0o777)
-    (tmp_path / "open").chmod(0o777)
-    (tmp_path / "open" / "a.zip").write_bytes(b"planted")
-    assert Store(tmp_path / "open").find("a") is None
-
-
-@pytest.mark.parametrize(
-    ("free", "wanted", "expected"),
-    [
-        ({"a": 4, "b": 2}, None, {"a": 4, "b": 2}),
-        ({"a": 4, "b": 0}, None, {"a": 4}),
-        ({"a": 4, "b": 2}, 3, {"a": 2, "b": 1}),
-        ({"a": 2, "b": 2}, 2, {"a": 1, "b": 1}),
-        ({"a": 1, "b": 1}, 9, {"a": 1, "b": 1}),
-        ({"a": 3}, 0, {}),
-    ],
-)
-def test_trials_at_a_time_are_divided_evenly(free, wanted, expected):
-    assert shares(free, wanted) == expected
 
 
 def roster(**slots):

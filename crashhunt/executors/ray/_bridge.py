@@ -277,13 +277,11 @@ class Bridge:
                 "home": self._parcel.home,
                 "slots": node.slots,
             }
-            self._call_node(node, "begin", job)
+            self._call_node(node, "begin", job, self._cluster.shared(self._parcel.packed))
         elif said == "ready":
             node.ready, node.since, self._ever_ready, self._alone = True, time.monotonic(), True, False
             self._send(capacity=self._scheduler.capacity)
             self._send_figures(now=True)
-        elif said == "lacks":
-            self._call_node(node, "deliver", self._cluster.shared(self._parcel.packed))
         else:
             self._refuse(node, said)
 

@@ -190,7 +190,7 @@ _ANSWER_S = 5.0  # for a head; it takes milliseconds where it is not very busy
 _STORE_BYTES = 400 * 10**6  # of a cluster of the hunt's own: room for a parcel; memory is taken when it is used
 _ORDERS, _ANSWERS = "orders", "answers"  # calls of one kind run in their order, in parallel to those of the other
 _ACTOR_PREFIX = "crashhunt-"  # of actors; what follows is how many CPUs one has
-_CONCURRENCY_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "deliver": _ANSWERS, "take": _ANSWERS}
+_CONCURRENCY_GROUPS = {"differs": _ANSWERS, "begin": _ANSWERS, "take": _ANSWERS}
 _CONCURRENCY_GROUPS |= {"submit": _ORDERS, "cancel": _ORDERS, "close": _ORDERS}
 
 

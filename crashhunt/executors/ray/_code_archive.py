@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 LIMIT_MB = 200
-"""What travels well: it is in the memory of the hunt's machine once, and on the disk of every node."""
+"""What travels well: it is in the memory of the hunt's machine once, and in the memory of every node."""
 _MEGABYTE = 10**6
 _SCENARIO, _CODE, _FILES = "scenario", "code", "files"
 
@@ -201,74 +201,6 @@ def _remove_if_left(folder: Path) -> None:
             with (folder / _FOLDER_LOCK).open("r+") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-# What a node keeps on its disk: parcels that it was sent, for hunts to come; and a folder for each hunt that runs.
-
-_KEPT_BYTES = 10**9  # of parcels
-_MAX_KEPT_ARCHIVES = 32
-
-
-class Store:
-    """The folder of this user on this machine, which all nodes on this machine share.
-
-    Args:
-        folder: path of the folder; by default a folder below the folder for temporary files.
-        kept_bytes: total size of the archives to keep, in bytes; the most recently used archives are kept.
-    """
-
-    def __init__(self, folder: Path | None = None, *, kept_bytes: int = _KEPT_BYTES) -> None:
-        self._kept_bytes = kept_bytes
-        self._folder = folder or Path(tempfile.gettempdir()) / f"crashhunt-{os.getuid()}"
-        try:
-            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            found = self._folder.lstat()
-            mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
-        except OSError:
-            mine = False
-        if not mine:  # foreign; its content would be run
-            self._folder = Path(tempfile.mkdtemp(prefix="crashhunt-"))
-
-    def find(self, digest: str) -> bytes | None:
-        """Return an archive, or None if it is not stored; damage is detected when it is unpacked."""
-        file = self._file(digest)
-        try:
-            packed = file.read_bytes()
-            os.utime(file)
-        except OSError:
-            return None
-        return packed
-
-    def keep(self, digest: str, packed: bytes) -> None:
-        """Store an archive, and delete the archives that have not been used for the longest time."""
-        file = self._file(digest)
-        part = file.with_name(f".{digest}.{os.getpid()}")
-        with suppress(OSError):  # it is sent again, then
-            part.write_bytes(packed)
-            part.replace(file)
-        with suppress(OSError):
-            part.unlink()
-        self._forget()
-
-    def drop(self, digest: str) -> None:
-        """Delete a damaged archive."""
-        with suppress(OSError):
-            self._file(digest).unlink()
-
-    def _file(self, digest: str) -> Path:
-        return self._folder / f"{digest}.zip"
-
-    def _forget(self) -> None:
-        found = []
-        for file in self._folder.glob("*.zip"):
-            with suppress(OSError):
-                found.append((file.stat().st_mtime, file.stat().st_size, file))
-        total = 0
-        for count, (_, size, file) in enumerate(sorted(found, reverse=True)):
-            total += size
-            if count and (total > self._kept_bytes or count >= _MAX_KEPT_ARCHIVES):
-                with suppress(OSError):
-                    file.unlink()
 
 
 class NodeFolder(TemporaryFolder):

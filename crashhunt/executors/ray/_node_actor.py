@@ -53,17 +53,12 @@ class Site:
                 found.append(f"crashhunt cannot be found there ({error})")
         return ", ".join(found)
 
-    def begin(self, job: Any) -> str:
-        """Prepare for the trials of a hunt; return ``ready``, ``lacks`` if the archive is missing, or an error."""
+    def begin(self, job: Any, packed: bytes) -> str:
+        """Prepare for the trials of a hunt with the archive of its code; return ``ready`` or an error."""
         from crashhunt.executors.ray._node_worker import Work
 
-        if self._work is None:
-            self._work = Work(job)
-        return str(self._work.begin())
-
-    def deliver(self, packed: bytes) -> str:
-        """Receive the archive; return the same values as `begin`."""
-        return str(self._work.deliver(packed))
+        self._work = Work(job)
+        return str(self._work.begin(packed))
 
     def submit(self, trials: list[tuple[int, dict[str, Any]]]) -> None:
         """Queue trials, each with its ticket."""

@@ -16,7 +16,7 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import WorkerSettings, scratch_of
 from crashhunt.executors._pool import PoolExecutor
-from crashhunt.executors.ray._code_archive import NodeFolder, Store, settings_in
+from crashhunt.executors.ray._code_archive import NodeFolder, settings_in
 from crashhunt.executors.ray._messages import Header, News, NodeJob, NodeTrial, Submitted
 from crashhunt.recording import read_header
 from crashhunt.trial import TrialSpec
@@ -40,7 +40,6 @@ class Work:
 
     def __init__(self, job: NodeJob) -> None:
         self._job = job
-        self._store = Store()
         self._place: NodeFolder | None = None
         self._pool: PoolExecutor | None = None
         self._lock = threading.Lock()
@@ -52,27 +51,11 @@ class Work:
         self._broken: CrashhuntError | None = None
         os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of the code of a hunt, which is there for this hunt only
 
-    def begin(self) -> str:
-        """Prepare the pool; return the value that `Site.begin` returns."""
-        packed = self._store.find(self._job["digest"])
-        if packed is None:
-            return "lacks"
-        if self._ready(packed):
-            return "ready"
-        self._store.drop(self._job["digest"])
-        return "lacks"
-
-    def deliver(self, packed: bytes) -> str:
-        """Prepare the pool with an archive that has been received."""
-        if not self._ready(packed):
-            return "the parcel was damaged on its way"
-        self._store.keep(self._job["digest"], packed)
-        return "ready"
-
-    def _ready(self, packed: bytes) -> bool:
+    def begin(self, packed: bytes) -> str:
+        """Prepare the pool with the archive of the code; return the value that `Site.begin` returns."""
         self._place = self._place or NodeFolder()
         if not self._place.unpack(packed, self._job["digest"]):
-            return False
+            return "the parcel was damaged on its way"
         settings = WorkerSettings.from_json(self._job["settings"])
         here = settings_in(settings, self._job["folders"], self._place.code, self._place.scratch)
         # What people and the ledger are told names the files of the machine where the hunt was begun.
@@ -82,7 +65,7 @@ class Work:
         if self._job["home"]:  # an agent may open its files by names that count from there
             os.chdir(self._place.code / self._job["home"])
         self._pool = PoolExecutor(here, parallel=self._job["slots"])
-        return True
+        return "ready"
 
     def submit(self, trials: Sequence[Submitted]) -> None:
         """Queue trials, except those that were cancelled before they arrived."""
