@@ -7,7 +7,6 @@ the signal or the exit code, and the reason in the program's log.
 from __future__ import annotations
 
 import os
-import re
 import select
 import stat
 import subprocess
@@ -17,7 +16,8 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from pydantic_core import from_json, to_json
 
-from crashhunt.agents._program_processes import MAX_FILE_BYTES, AttachedProgram, ProgramProcess, launch, read_format
+from crashhunt.agents._program_logs import reason_in
+from crashhunt.agents._program_processes import AttachedProgram, ProgramProcess, launch, read_format
 from crashhunt.base import forks
 from crashhunt.base.errors import ProgramError
 from crashhunt.base.processes import descendants_of, kill
@@ -38,29 +38,7 @@ _MAX_REPEATED_BYTES: Final = 256 << 20  # of the observations that a fork of the
 _MAX_SHOWN_CHARACTERS: Final = 80
 _CLOSING_S: Final = 1.0  # from `close` to the end of the program
 _TERMINATION_S: Final = 0.2  # from SIGTERM to SIGKILL
-_MAX_REPORT_BYTES: Final = 1 << 20  # of the end of the log, which may have the report of a sanitizer
-_MAX_REASON_CHARACTERS: Final = 300
 _LOGS_FIX = "write only messages to standard output, {}, and logs to standard error"
-_REASONS: Final = tuple(
-    re.compile(pattern, re.MULTILINE)
-    for pattern in (
-        r"^SUMMARY: (\w+Sanitizer: .+)$",
-        r"^(.+: runtime error: .+)$",  # of the sanitizer for undefined behaviour
-        r"^(.+: Assertion .+ failed\.)$",
-        r"^terminate called after throwing an instance of '(.+)'\n {2}what\(\): +(.+)$",
-        r"^(terminate called .+)$",
-        r"^(\*\*\* .+ \*\*\*: terminated)$",  # of glibc, as the next one
-        r"^(double free or corruption.*|(?:free|malloc|realloc|munmap_chunk)\(\): .+|corrupted size vs\. .+)$",
-        # Uncaught exceptions and panics. Programs may log those that they catch, so Python's must be the log's end.
-        r"^thread '.*' (?:\(\d+\) )?panicked at (.+?):?\n(.+)$",  # of Rust
-        r"^((?:panic|fatal error): .+)$",  # of Go
-        r"^Exception in thread \".*\" (.+)$",  # of Java
-        r"^(\w*Error\b.*)\n(?: {4}at .*\n)+(?:(?:[ }].*)?\n)*Node\.js v.+\s*\Z",
-        r"^Traceback \(most recent call last\):\n(?:[ \t].*\n)+(\w.*)\s*\Z",
-    )
-)
-"""What the log of a program names as the reason of its end: sanitizers, assert, exceptions, a damaged heap."""
-
 _inherited: list[ProgramProcess] = []
 """Programs of the process of which this one is a fork. Their pipes are closed here, so nothing may close them again."""
 
@@ -322,22 +300,10 @@ class ProgramExchange:
             )
         code = process.returncode or 0
         end = f"died of {signal_name(code)}" if code < 0 else f"exited with {code}"
-        return ProgramError(f"the program {end} instead of answering {shown}{half}{self._reason()}")
-
-    def _reason(self) -> str:
-        """Return the reason that the program has written to its standard error, after a colon; empty if it has none."""
-        if self._log_begin is None:
-            return ""
-        source = self._log if self._attached is None else self._attached.log
-        with suppress(OSError), open(f"/proc/self/fd/{source}", "rb") as log:
-            size = log.seek(0, os.SEEK_END)
-            if size >= MAX_FILE_BYTES:
-                return f": its log has reached {MAX_FILE_BYTES >> 20} MB"
-            log.seek(max(self._log_begin, size - _MAX_REPORT_BYTES))
-            text = log.read(_MAX_REPORT_BYTES).decode("utf-8", "replace")
-            found = next((match for pattern in _REASONS if (match := pattern.search(text))), None)
-            return f": {one_line(': '.join(found.groups()))[:_MAX_REASON_CHARACTERS]}" if found else ""
-        return ""
+        reason = ""
+        if self._log_begin is not None:
+            reason = reason_in(self._log if self._attached is None else self._attached.log, self._log_begin)
+        return ProgramError(f"the program {end} instead of answering {shown}{half}{reason}")
 
     @staticmethod
     def _ends_within(process: ProgramProcess, limit_s: float) -> bool:

@@ -56,6 +56,13 @@ def lane_place(network: RoadNetwork, vehicle: RoadObject, other: RoadObject) -> 
     return LanePlace(same_lane=same, offset=0.0 - float(right), index=index)
 
 
+def is_at_an_end(vehicle: RoadObject, network: RoadNetwork) -> bool:
+    """Return whether a vehicle has driven off the end of a lane that has no following lane."""
+    along, lateral = vehicle.lane.local_coordinates(vehicle.position)
+    inside = abs(lateral) <= vehicle.lane.width_at(along) / 2
+    return inside and along > vehicle.lane.length and vehicle.lane_index[1] not in network.graph
+
+
 def gap(one: RoadObject, two: RoadObject) -> float:
     """Return the distance between the outlines of two objects, in m."""
     x, y = (two.position - one.position).tolist()

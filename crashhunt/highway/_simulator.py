@@ -34,7 +34,15 @@ from crashhunt.highway._config import apply_changes, configured, mistake, note_c
 from crashhunt.highway._descriptor import BACKEND, HighwaySetup
 from crashhunt.highway._disturbances import HighwayDisturbances
 from crashhunt.highway._lane_parts import LANE_PARTS, LaneParts
-from crashhunt.highway._lanes_and_contacts import Hidden, HighwayEvents, VehicleFilter, contact_of, lane_place, lanes_of
+from crashhunt.highway._lanes_and_contacts import (
+    Hidden,
+    HighwayEvents,
+    VehicleFilter,
+    contact_of,
+    is_at_an_end,
+    lane_place,
+    lanes_of,
+)
 from crashhunt.highway._scripted import Puppet, Puppets
 from crashhunt.highway._steering import action_with, is_steered, motion_of
 from crashhunt.highway._surroundings import surroundings_of
@@ -197,7 +205,7 @@ class HighwaySimulator:
             self._places[agent] = [x, y]
             was, self._on_road[agent] = self._on_road[agent], bool(vehicle.on_road)
             if self._lanes_are_road and agent in actions and was and not self._on_road[agent]:
-                (arrived if self._is_at_an_end(vehicle) else off_road).append(agent)
+                (arrived if is_at_an_end(vehicle, self._env.road.network) else off_road).append(agent)
         self._read_scene(tuple(off_road))
         self._scene.events = tuple([event for agent in actions for event in self._events_of(agent)])
         is_terminated = truth_of(terminated, "terminated", _STEP_FIX)
@@ -416,12 +424,6 @@ class HighwaySimulator:
         self._puppets = Puppets(self._env.road, script, self._controlled, sub_steps, self.step_length_s)
         self._begins_s = script.time_s
         self._known |= {id(thing): (thing, actor) for thing, actor in self._puppets.actors}
-
-    def _is_at_an_end(self, vehicle: RoadObject) -> bool:
-        """Return whether a vehicle has driven off the end of a lane that has no following lane."""
-        along, lateral = vehicle.lane.local_coordinates(vehicle.position)
-        inside = abs(lateral) <= vehicle.lane.width_at(along) / 2
-        return inside and along > vehicle.lane.length and vehicle.lane_index[1] not in self._env.road.network.graph
 
     def _idle(self, agent: str) -> Any:
         kind, space = self._kinds[agent], self.actions[agent].space

@@ -5,11 +5,9 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
+    from ._argument_importance import importance_of as importance_of
     from ._argument_words import argument_units as argument_units
-    from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
-    from ._crash_text import Story as Story, describe_note as describe_note
-    from ._crash_types_table import describe_causes as describe_causes, describe_groups as describe_groups
-    from ._findings import (
+    from ._ci_findings import (
         corpus_annotations as corpus_annotations,
         corpus_summary as corpus_summary,
         crash_annotations as crash_annotations,
@@ -17,6 +15,9 @@ if TYPE_CHECKING:
         findings_of as findings_of,
         write_sarif as write_sarif,
     )
+    from ._comparison_text import comparison_page as comparison_page, describe_comparison as describe_comparison
+    from ._crash_text import Story as Story, describe_note as describe_note
+    from ._crash_types_table import describe_causes as describe_causes, describe_groups as describe_groups
     from ._gate_report import (
         describe_gate as describe_gate,
         gate_annotations as gate_annotations,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from ._page import (
         GOLDEN_RATIO as GOLDEN_RATIO,
         UNCHOSEN as UNCHOSEN,
-        importance_of as importance_of,
         is_drawn as is_drawn,
         lineage_of as lineage_of,
         player_data as player_data,

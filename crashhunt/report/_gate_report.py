@@ -7,7 +7,7 @@ from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import output_file
 from crashhunt.base.text import command_line, count_of, format_number, in_lines, visible
-from crashhunt.report._findings import escaped, row_of
+from crashhunt.report._ci_findings import escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
 if TYPE_CHECKING:

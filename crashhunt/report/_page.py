@@ -11,7 +11,7 @@ import math
 from contextlib import closing
 from dataclasses import asdict
 from importlib import resources
-from typing import TYPE_CHECKING, NamedTuple, TypedDict
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.recording import is_opaque, read_lanes, read_obstacles
+from crashhunt.report._argument_importance import MOST_WEIGHED, importance_of
 from crashhunt.report._argument_words import argument_units, format_arguments
 from crashhunt.report._crash_text import Story, describe_note
 from crashhunt.report._disturbance_words import by_likelihood, may_be_disturbed, traffic_of
@@ -52,25 +53,12 @@ if TYPE_CHECKING:
     from crashhunt.world import Actor, Scene
 
 
-# The search on the page: the arguments that criticality depends on, and the trials that a crash was derived from.
+# The search on the page: the trials, and those that a crash was derived from.
 
 UNCHOSEN = ("", "random", "start", "halton")
 """Origins of trials that were chosen without learning, so that they cover the whole space."""
 
-_LEAST, _MOST = 40, 4000  # trials
-_IMPORTANCE_PARTS = 5  # of a range, with as many trials each
-_BOOTSTRAP_RESAMPLES = 200
-_INTERVAL_PERCENTILES = (5.0, 95.0)
 _MAX_GENERATIONS = 50  # of a lineage; more are unreadable
-
-
-class Importance(TypedDict):
-    """The share of the variation of criticality that one argument explains alone, 0 to 1, with a 90 % interval."""
-
-    name: str
-    share: float
-    low: float
-    high: float
 
 
 def values_of(row: TrialRow) -> dict[str, Value]:
@@ -99,64 +87,6 @@ def trial_point(row: TrialRow) -> dict[str, object]:
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else round(value, 4)
-
-
-def importance_of(trials: Sequence[tuple[Mapping[str, Value], float]]) -> list[Importance]:
-    """Return the contribution of each argument to the criticality, the most important argument first.
-
-    The contribution is the correlation ratio of the ranks of criticality over five parts of a range, or over the
-    options of a choice. The value expected by chance alone is subtracted (Kelley's epsilon squared, 1935). The result
-    is the share of the variance that an argument explains without the other arguments. The interval comes from a
-    bootstrap over trials.
-
-    Args:
-        trials: arguments and criticality (1 for a crash) of trials that the search did not guide.
-
-    Returns:
-        The contributions; an empty list for fewer than 40 trials.
-    """
-    if len(trials) > _MOST:
-        trials = [trials[place * len(trials) // _MOST] for place in range(_MOST)]
-    if len(trials) < _LEAST:
-        return []
-    dangers = np.array([danger for _, danger in trials])
-    ranks = np.searchsorted(np.sort(dangers), dangers, "left") + np.searchsorted(np.sort(dangers), dangers, "right")
-    names = {name: None for values, _ in trials for name in values}
-    rng = np.random.default_rng(0)
-    again = rng.integers(len(trials), size=(_BOOTSTRAP_RESAMPLES, len(trials)))
-    found = []
-    for name in names:
-        parts = _range_parts([values.get(name) for values, _ in trials])
-        if parts.max() < 1:
-            continue
-        share = _explained(ranks, parts)
-        shares = np.array([_explained(ranks[drawn], parts[drawn]) for drawn in again])
-        shares -= shares.mean() - share  # trials that were drawn twice look as if they explained each other
-        low, high = (float(end) for end in np.clip(np.percentile(shares, _INTERVAL_PERCENTILES), 0.0, 1.0))
-        found.append(Importance(name=name, share=share, low=min(low, share), high=max(high, share)))
-    return sorted(found, key=lambda one: -one["share"])
-
-
-def _range_parts(values: Sequence[Value | None]) -> NDArray[np.intp]:
-    """Return for each value the part of the range that contains the value, counted from 0; for text, its index."""
-    kinds = list(dict.fromkeys(values))
-    if len(kinds) <= _IMPORTANCE_PARTS or not all(isinstance(value, int | float) for value in kinds):
-        return np.array([kinds.index(value) for value in values])
-    numbers = np.array(values, dtype=float)
-    edges = np.unique(np.quantile(numbers, np.arange(1, _IMPORTANCE_PARTS) / _IMPORTANCE_PARTS))
-    return np.searchsorted(edges, numbers, "right")
-
-
-def _explained(ranks: NDArray[np.intp], parts: NDArray[np.intp]) -> float:
-    counts = np.bincount(parts)
-    sums = np.bincount(parts, ranks)
-    there, total = counts > 0, len(ranks)
-    whole = float(((ranks - ranks.mean()) ** 2).sum())
-    between = float((sums[there] ** 2 / counts[there]).sum() - total * ranks.mean() ** 2)
-    groups = int(there.sum())
-    if whole <= 0.0 or total <= groups:
-        return 0.0
-    return max(0.0, 1.0 - (whole - between) / (total - groups) * (total - 1) / whole)
 
 
 def lineage_of(number: int, trial: Callable[[int], JsonObject | None]) -> list[list[object]]:
@@ -359,7 +289,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             counts = outcome in settings.crash_on
             if row.origin in UNCHOSEN and row.parent is None and danger is not None and row.number not in apart:
                 unchosen_in_all += 1
-                if is_drawn(number, 2 * _MOST / max(total, 1)):
+                if is_drawn(number, 2 * MOST_WEIGHED / max(total, 1)):
                     unchosen.append((values_of(row), danger))
             if is_drawn(number, share_of_crashes if counts else share):
                 trials.append(trial_point(row))
@@ -375,7 +305,7 @@ def _trials(directory: Path, settings: HuntSettings) -> dict[str, object]:
             "rate": _rate(facts.get("running_rate"), describe_versions(map(asdict, versions)) if versions else ""),
             "notices": facts.get("notices") or [],
             "typesByCause": facts.get("types_by_cause"),
-            "weighed": [min(len(unchosen), _MOST), unchosen_in_all] if unchosen_in_all > _MOST else None,
+            "weighed": [min(len(unchosen), MOST_WEIGHED), unchosen_in_all] if unchosen_in_all > MOST_WEIGHED else None,
         }
 
 

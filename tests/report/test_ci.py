@@ -90,7 +90,7 @@ def test_the_place_of_a_collision_is_where_the_agent_is_defined(tmp_path, groups
             driver = type("Driver", (), {"agent": "planner:Planner"})
             return type("Settings", (), {"agents": {"ego": driver}})
 
-    monkeypatch.setattr("crashhunt.report._findings.Snapshot", Kept)
+    monkeypatch.setattr("crashhunt.report._ci_findings.Snapshot", Kept)
     (finding,) = findings_of(groups[:1])
     assert (finding.file, finding.line) == ("pkg/planner.py", 7)
 

@@ -12,7 +12,8 @@ from crashhunt.base import layout
 from crashhunt.crashes import list_bundles
 from crashhunt.ledger import Ledger
 from crashhunt.report import _page
-from crashhunt.report._page import importance_of, lineage_of, report_data
+from crashhunt.report._argument_importance import importance_of
+from crashhunt.report._page import lineage_of, report_data
 from crashhunt.results import HuntResults, find_crashes
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
