@@ -74,7 +74,7 @@ _TESTS_ELSEWHERE = {
     "panels": ("render/test_panels*.py", "render/test_pictures.py"),
     # These are tested as users run them: as commands.
     "cli/__init__.py": ("cli/test_answers.py", "e2e/test_commands.py"),
-    "cli/_bisect.py": ("e2e/test_bisect.py",),
+    "cli/_bisect.py": ("cli/test_answers_on_crashes.py",),
     "cli/_check.py": ("e2e/test_check.py",),
     "cli/_common.py": ("cli/test_answers.py", "e2e/test_commands.py"),
     "cli/_compare.py": (
@@ -83,10 +83,7 @@ _TESTS_ELSEWHERE = {
     ),
     "cli/_completion.py": ("e2e/test_completion.py",),
     "cli/_corpus.py": ("e2e/test_corpus.py",),
-    "cli/_crashes.py": (
-        "cli/test_answers_on_crashes.py",
-        "e2e/test_types_by_cause.py",
-    ),
+    "cli/_crashes.py": ("cli/test_answers_on_crashes.py",),
     "cli/_dashboard.py": ("dashboard/test_command.py",),
     "cli/_export.py": ("e2e/test_export.py",),
     "cli/_gate.py": ("e2e/test_gate.py",),
@@ -117,7 +114,7 @@ _TESTS_ELSEWHERE = {
     "cli/_trust.py": ("cli/test_common.py", "e2e/test_foreign_hunts.py"),
     "cli/_whatif.py": ("e2e/test_what_if.py",),
     "corpus": ("corpus/test_*.py", "e2e/test_corpus.py"),
-    "corpus/_bisection.py": ("e2e/test_bisect.py",),
+    "corpus/_bisection.py": ("corpus/test_bisection.py",),
     "crashes/_before_contact.py": ("crashes/test_contact_record.py", "crashes/test_fault.py"),
     "crashes/_bundle_trust.py": ("e2e/test_foreign_hunts.py",),
     "crashes/_saved_crashes.py": ("crashes/test_archive.py", "crashes/test_bundle.py"),
@@ -247,7 +244,7 @@ _TESTS_ELSEWHERE = {
     "analysis/_driver_runs.py": ("analysis/test_judged_crash.py", "e2e/test_preventability.py"),
     "analysis/_minimization.py": ("analysis/test_what_is_tried.py",),
     "analysis/_interventions.py": ("analysis/test_what_is_counted.py", "e2e/test_what_if.py"),
-    "analysis/_types_by_cause.py": ("e2e/test_types_by_cause.py",),
+    "analysis/_types_by_cause.py": ("analysis/test_division_by_cause.py",),
     "world": ("world/test_*.py",),
     "world/_events.py": ("on_sumo/test_events.py",),
     "world/_manoeuvre_motions.py": ("world/test_manoeuvre_motions.py",),

@@ -61,25 +61,6 @@ def rewritten(source, target, change):
     return target
 
 
-@pytest.mark.nightly
-def test_a_forged_signature_is_a_strangers(exported):
-    def forge(name, data):
-        if name == "hunt.toml":
-            data = data.replace(b"my_pkg.agents:Planner", b"evil:Agent")
-            digests["hunt.toml"] = {"size": len(data), "blake2b": digest_of_content(data)}
-        if name == "archive.json":
-            index = json.loads(data)
-            index.update(made_by="you@here", files=index["files"] | digests)
-            data = json.dumps(index).encode()
-        yield name, data
-
-    digests: dict[str, object] = {}
-    forged = rewritten(exported.folder / "crash ä.zip", exported.folder / "forged.zip", forge)
-    refused = exported.crashhunt("replay", forged.name, expect=2).err
-    assert "you@here on " in refused
-    assert "evil:Agent" in refused
-
-
 @pytest.fixture(scope="module")
 def small_archive(tmp_path_factory):
     path = tmp_path_factory.mktemp("archive") / "small.zip"

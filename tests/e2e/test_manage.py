@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 from conftest import keeps_going
 
@@ -42,3 +43,10 @@ def test_tables_of_trials(toy, made_once):
     ):
         assert says in toy.crashhunt("trials", "h", *words, expect=2).err
     assert not list(toy.folder.glob(".*.part"))
+
+
+def test_what_has_no_crashes_and_what_is_no_hunt(toy, made_once):
+    shutil.rmtree(made_once(keeps_going, toy).folder / "h" / "crashes")
+    assert toy.crashhunt("crashes", "h").out == "No crash was saved.\n"
+    assert toy.crashhunt("crashes", "h", "--json").json == {"groups": [], "left_out": []}
+    assert "'h2' does not exist" in toy.crashhunt("crashes", "h2", expect=2).err

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-
-import pytest
-
 SUITE = """
 [defaults]
 scenario = "toy"
@@ -27,24 +23,6 @@ scenario_arguments.gap_m = 50
 
 def written(shell, text: str) -> None:
     (shell.folder / "suite.toml").write_text(text, encoding="utf-8")
-
-
-@pytest.mark.nightly
-def test_every_hunt_stops_at_its_own_first_crash(toy):
-    written(toy, SUITE)
-    done = toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json
-    found = {hunt["dir"].removeprefix("out/"): hunt for hunt in done["hunts"]}
-    assert {name: hunt["state"] for name, hunt in found.items()} == {
-        "fast/0": "crashed", "fast/1": "crashed", "slow/0": "finished",
-    }  # fmt: skip
-    assert found["slow/0"]["trials_run"] == found["slow/0"]["trials_planned"] == 8
-    seeds = {tomllib.loads((toy.folder / f"out/{name}/hunt.toml").read_text())["seed"] for name in found}
-    assert len(seeds) == 2  # a seed a run; the same seed for equal numbers
-    assert toy.crashhunt("replay", "out/fast/1", "--json").json["verdict"] == "reproduced"
-    # Again, nothing runs.
-    before = (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns
-    assert toy.crashhunt("suite", "run", "suite.toml", "out", "2", "--json").json["hunts"] == done["hunts"]
-    assert (toy.folder / "out/slow/0/ledger.sqlite").stat().st_mtime_ns == before
 
 
 def test_snapshots_of_a_suite_take_in_what_is_asked_for(toy):

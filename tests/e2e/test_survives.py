@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
 from crashhunt.errors import ArgumentError
 from crashhunt.testing import assert_survives
-
-
-@pytest.mark.nightly
-def test_what_is_printed_of_a_crash_in_traffic_is_small_and_can_be_pasted(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = {"trials": 6, "max_steps": 300, "arguments": {"speed": "17:25"}}
-    with pytest.raises(AssertionError, match="ego drove into left") as raised:
-        assert_survives("crashhunt.agents:KeepLaneWithSpeed", "loop", **words)
-    (call,) = re.findall(r"^    (assert_survives\(.*\))$", str(raised.value), re.MULTILINE)
-    assert "'only': [" in call  # the others drive: actors moved as recorded could not be pasted
-    with pytest.raises(AssertionError) as again:
-        exec(call, {"assert_survives": assert_survives})
-    assert str(again.value).splitlines()[1] == str(raised.value).splitlines()[1]
-
 
 NEEDS = """
 class Needs:
