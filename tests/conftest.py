@@ -594,6 +594,15 @@ def crashes_on_loop(shell: Shell) -> None:
 
 
 @pytest.fixture
+def sumo_runs(tmp_path):
+    """Writes scenarios of SUMO and runs them; the simulators are closed when the test ends."""
+    from sumo_runs import SumoRuns
+
+    with SumoRuns(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
 def agents_may_command_sumo(monkeypatch):
     """Lets agents of a test command SUMO, which brings about in a few steps what rarely happens by itself."""
     from crashhunt.sumo import _agent_calls  # imports libsumo, which other tests do not need

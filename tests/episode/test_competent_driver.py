@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from onlookers import Always
+from sumo_runs import SumoRuns
 
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode._reference_driver_takeover import CompetentDriver
-from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import Overruled
 
 CASE = {"ego_kmh": 60.0, "other_kmh": 20.0, "gap_m": 35.0, "lateral_mps": 1.5, "side": 1}
@@ -38,11 +35,8 @@ class OpenLoop(Always):
 
 def driven(folder, form):
     """Return the speeds of the vehicle, and what the driver reports."""
-    scenario = load_scenario("r157-cut-in")
-    scenario = replace(scenario, agents={"ego": replace(scenario.agents["ego"], action=form)})
-    simulator = SumoSimulator(scenario, folder)
-    try:
-        observations, _ = simulator.reset(seed=1, options={"arguments": CASE})
+    with SumoRuns(folder) as runs:
+        simulator, observations = runs.begin("r157-cut-in", 1, CASE, action=form)
         agent = OpenLoop(simulator) if form == "trajectory" else Always(KEEPS_SPEED.get(form, 1))
         driver = CompetentDriver(agent, simulator, Overruled("ego", 0, reference="fsm", other="other"))
         driver.reset(1)
@@ -53,8 +47,6 @@ def driven(folder, form):
             scene = simulator.scene()
             speeds.append(float(scene.speeds[scene.roster.index["ego"]]))
         return np.array(speeds), driver.responses[0]
-    finally:
-        simulator.close()
 
 
 @pytest.fixture(scope="module")

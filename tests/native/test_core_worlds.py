@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from crashhunt.agents import KeepLaneWithSpeed
-from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
-from crashhunt.recording import BlackBox
-from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSetup
+from crashhunt.scenario import AgentSetup
 from crashhunt.trial import TrialSpec
 
 core = pytest.importorskip("_crashhunt_core", reason="the compiled core is not built")
@@ -94,34 +90,24 @@ WORLDS = {
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_trial_in_another_world_is_the_same_bit_by_bit(tmp_path, world):
-    from crashhunt.sumo import SumoSimulator
-
+def test_a_trial_in_another_world_is_the_same_bit_by_bit(sumo_runs, world):
     net, traffic, step_s, steps = WORLDS[world]
-    shutil.copy(NETS / f"{net}.net.xml", tmp_path)
-    (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>", encoding="utf-8")
-    (tmp_path / "scenario.toml").write_text(
-        f'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = {step_s}\nwarmup_s = 0.0\n'
-        f'[sumo]\nnet = "{net}.net.xml"\nroutes = ["r.rou.xml"]\noptions = {{ time-to-teleport = 2 }}\n'
-        "[agents.ego]\nexisting = true\n"
-    )
     found, used = [], []
     for native in (None, False):
-        scenario = load_scenario(tmp_path)
-        scenario = scenario.with_table(replace(scenario.table(SumoSetup), native=native))
-        stage = tmp_path / f"stage-{native}"
-        stage.mkdir()
-        simulator = SumoSimulator(scenario, stage)
-        box = BlackBox(stage / "box")
-        box.begin(pid=0, trial=0, started=0.0)
-        result = run_episode(
-            TrialSpec(0, 1, {}, {}, steps), simulator=simulator, make_agent=lambda *_: KeepLaneWithSpeed(12.0),
-            box=box, oracles=(ReportedCollision(), Overlap(), OffRoad()),
+        table = {"options": {"time-to-teleport": 2}, "native": native}
+        simulator = sumo_runs.written(
+            NETS / f"{net}.net.xml", f"<routes>{traffic}</routes>", table=table, step_length_s=step_s, warmup_s=0.0,
+            agents={"ego": AgentSetup(existing=True)},
         )  # fmt: skip
+        spec, oracles = TrialSpec(0, 1, {}, {}, steps), (ReportedCollision(), Overlap(), OffRoad())
+        result, recording = sumo_runs.record(simulator, spec, KeepLaneWithSpeed(12.0), oracles=oracles)
         used.append(simulator._sight.core is core)
-        found.append((repr(replace(result, setup_s=0.0, wall_s=0.0)), bytes(box.committed())))
-        simulator.close()
-        box.close()
+        found.append(
+            (
+                repr(replace(result, setup_s=0.0, wall_s=0.0)),
+                [(one.tag, bytes(one.payload)) for one in recording.records],
+            )
+        )
         assert result.steps > 5, result.failure
         assert not simulator.notices
     assert used == [True, False]

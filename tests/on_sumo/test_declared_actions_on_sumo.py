@@ -11,21 +11,16 @@ import pytest
 import crashhunt.guide
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.episode import overruled_agent
-from crashhunt.scenario import ACTIONS, argument_values, load_scenario, with_action
-from crashhunt.sumo import SumoSimulator
+from crashhunt.scenario import ACTIONS, load_scenario, with_action
 from crashhunt.trial import Overruled
 
 
 @pytest.fixture
-def start(tmp_path):
+def start(sumo_runs):
     """Return a function that begins an episode in a form of actions, and returns a function that takes a step."""
-    made = []
 
     def begin(form, scenario="loop", seed=3, **values):
-        chosen = with_action(load_scenario(scenario), "ego", form)
-        simulator = SumoSimulator(chosen, tmp_path)
-        made.append(simulator)
-        simulator.reset(seed=seed, options={"arguments": {**argument_values(chosen), **values}})
+        simulator, _ = sumo_runs.begin(with_action(load_scenario(scenario), "ego", form), seed, values)
 
         def step(action):
             simulator.step({"ego": simulator.actions["ego"].encode(action)})
@@ -34,9 +29,7 @@ def start(tmp_path):
         step.simulator = simulator
         return step
 
-    yield begin
-    for simulator in made:
-        simulator.close()
+    return begin
 
 
 @pytest.mark.parametrize("acceleration", [-1.0, 1.0])

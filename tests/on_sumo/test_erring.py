@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +12,8 @@ from onlookers import Steady, Watch
 
 from crashhunt.disturbances import disturber_of
 from crashhunt.episode import Episode
-from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
-from crashhunt.sumo import SumoSetup, SumoSimulator
+from crashhunt.scenario import AgentSetup, argument_values, load_scenario
+from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import Disturbance, TrialSpec
 
 NET = Path(__file__).with_name("signal.net.xml")
@@ -32,39 +31,23 @@ LEFT = '<vehicle id="left" type="car" route="across" depart="0" departPos="{}" d
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(sumo_runs):
     """Starts an episode on a street with a signal; returns it and who watches."""
-    made = []
+    ego = AgentSetup(route="across", type="fast", depart_lane="0", depart_pos="35", depart_speed="8")
 
     def begin(*disturbances, traffic=AHEAD + BEHIND, steps=400, dt=0.1, agent=None, driven=(), strength=None):
-        folder = tmp_path / f"s{len(made)}"
-        (folder / "stage").mkdir(parents=True)
-        shutil.copy(NET, folder)
-        (folder / "r.rou.xml").write_text(ROUTES.format(traffic=traffic))
-        scenario = Scenario(
-            step_length_s=dt,
-            warmup_s=1.0,
-            agents={
-                "ego": AgentSetup(route="across", type="fast", depart_lane="0", depart_pos="35", depart_speed="8"),
-                **dict.fromkeys(driven, AgentSetup(existing=True)),
-            },
-            tables={"sumo": SumoSetup(net=NET.name, routes=("r.rou.xml",))},
-            folder=folder,
-        )
+        agents = {"ego": ego, **dict.fromkeys(driven, AgentSetup(existing=True))}
+        routes = ROUTES.format(traffic=traffic)
+        simulator = sumo_runs.written(NET, routes, step_length_s=dt, warmup_s=1.0, agents=agents)
         watch = Watch()
-        simulator = SumoSimulator(scenario, folder / "stage")
         spec = TrialSpec(0, 1, {}, strength or {}, steps, disturbances=disturbances)
         given = {"simulator": simulator, "make_agent": lambda *_: agent or Steady(), "observers": (watch,)}
-        episode = Episode(spec, **given)
-        made.append((episode, simulator))
+        episode = sumo_runs.enter_context(Episode(spec, **given))
         episode.start()
         assert episode.result is None, episode.result.failure
         return episode, watch
 
-    yield begin
-    for episode, simulator in made:
-        episode.close()
-        simulator.close()
+    return begin
 
 
 def planned(step, what, who="ahead", strong=3.0, long=1.0):

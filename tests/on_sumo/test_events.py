@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -13,13 +12,11 @@ import numpy as np
 import pytest
 from conftest import mostly_nightly
 
-from crashhunt.episode import run_episode
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._descriptor import HighwaySetup
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
-from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.sumo import SumoEvents, SumoSetup, SumoSimulator
+from crashhunt.sumo import SumoEvents
 from crashhunt.trial import CRASHES, Outcome, TrialSpec
 
 pytestmark = pytest.mark.usefixtures("agents_may_command_sumo")
@@ -48,49 +45,30 @@ class Script:
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(sumo_runs):
     """Runs an episode on a signalled crossing; returns its result and the events with their steps."""
-    made = []
 
     def run(act, *, route="across", traffic="", steps=300, dt=0.1, warmup_s=0.0, crash_on=CRASHES, **more):
         limits, options, net = more.pop("limits", {}), more.pop("options", {}), more.pop("net", NET)
         routes, setup = more.pop("routes", ROUTES), {"type": "car", **more}
-        folder = tmp_path / f"scenario{len(made)}"
-        (folder / "stage").mkdir(parents=True)
-        shutil.copy(net, folder)
-        (folder / "r.rou.xml").write_text(routes.format(traffic=traffic))
-        agents = {"ego": AgentSetup(**({} if setup.get("existing") else {"route": route}), **setup)}
-        scenario = Scenario(
+        simulator = sumo_runs.written(
+            net,
+            routes.format(traffic=traffic),
+            table={"options": options},
             step_length_s=dt,
             warmup_s=warmup_s,
-            agents=agents,
-            tables={"sumo": SumoSetup(net=net.name, routes=("r.rou.xml",), options=options)},
+            agents={"ego": AgentSetup(**({} if setup.get("existing") else {"route": route}), **setup)},
             events=limits,
-            folder=folder,
         )
-        simulator = SumoSimulator(scenario, folder / "stage")
-        box = BlackBox(folder / "box")
-        made.append((simulator, box))
-        box.begin(pid=1, trial=0, started=0.0)
-        result = run_episode(
-            TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps),
-            simulator=simulator,
-            make_agent=lambda *_: Script(act),
-            box=box,
-            oracles=[ReportedCollision(), Overlap(), OffRoad()],
-            crash_on=crash_on,
-        )
+        oracles = [ReportedCollision(), Overlap(), OffRoad()]
+        spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps)
+        result, recording = sumo_runs.record(simulator, spec, Script(act), oracles=oracles, crash_on=crash_on)
         assert result.failure is None, result.failure.traceback
-        recording = Recording(read_black_box(folder / "box"))
-        assert recording.digest == result.digest
         told = [(step.step, event) for step in recording.all_steps if step.scene for event in step.scene.events]
         assert result.events == Counter(event.kind for _, event in told)
         return result, told
 
-    yield run
-    for simulator, box in made:
-        simulator.close()
-        box.close()
+    return run
 
 
 BEYOND = {":c_5_0": ":c_6_0"}  # who turns left may wait in the middle of the crossing

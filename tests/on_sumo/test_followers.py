@@ -35,19 +35,14 @@ SEEN = pytest.mark.parametrize("visible", ["front", "whole"])
 
 
 @pytest.fixture
-def begin(tmp_path):
+def begin(sumo_runs):
     """Return a function that begins an episode on an empty road, with a vehicle behind ego."""
-    made = []
 
     def begun(scenario, visible, form="acceleration_steering", **values):
-        loaded = load_scenario(scenario)
-        chosen = with_action(loaded, "ego", f"{form}:visible={visible}")
-        made.append(Drive(SumoSimulator(chosen, tmp_path), {**argument_values(chosen), **EMPTY[scenario], **values}))
-        return made[-1]
+        chosen = with_action(load_scenario(scenario), "ego", f"{form}:visible={visible}")
+        return Drive(sumo_runs.open(chosen), {**argument_values(chosen), **EMPTY[scenario], **values})
 
-    yield begun
-    for drive in made:
-        drive.simulator.close()
+    return begun
 
 
 class Drive:

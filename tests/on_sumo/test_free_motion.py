@@ -15,9 +15,8 @@ import sumolib
 
 from crashhunt.base.errors import ActionError
 from crashhunt.oracles import Overlap
-from crashhunt.scenario import AgentSetup, argument_values, load_scenario
+from crashhunt.scenario import AgentSetup, load_scenario
 from crashhunt.simulators import BicycleModel, MotionState
-from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._drivable_area import DrivableArea, _is_inside, _overlap
 from crashhunt.sumo._free_motion import FreeMotion, _words_of
 from crashhunt.world import Contact, describe_road_map
@@ -26,17 +25,13 @@ EMPTY = {"priority_demand": 1, "minor_demand": 1}
 
 
 @pytest.fixture
-def start(tmp_path):
+def start(sumo_runs):
     """Return a function that begins an episode, and returns the simulator and a function that takes a step."""
-    made = []
 
     def begin(form, scenario="intersection", seed=3, **values):
         loaded = load_scenario(scenario)
-        agents = {agent: AgentSetup(**{**vars(setup), "action": form}) for agent, setup in loaded.agents.items()}
-        chosen = type(loaded)(**{**vars(loaded), "agents": agents})
-        simulator = SumoSimulator(chosen, tmp_path)
-        made.append(simulator)
-        simulator.reset(seed=seed, options={"arguments": {**argument_values(chosen), **values}})
+        agents = {agent: replace(setup, action=form) for agent, setup in loaded.agents.items()}
+        simulator, _ = sumo_runs.begin(replace(loaded, agents=agents), seed, values)
 
         def step(*actions):
             given = dict(zip(simulator.agents, actions, strict=True))
@@ -47,9 +42,7 @@ def start(tmp_path):
 
         return simulator, step
 
-    yield begin
-    for simulator in made:
-        simulator.close()
+    return begin
 
 
 def centre(agent="ego"):

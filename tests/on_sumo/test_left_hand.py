@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +10,6 @@ import libsumo
 import pytest
 
 from crashhunt.oracles import Overlap
-from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._bent_vehicles import Bends
 from crashhunt.trial import Disturbance
 
@@ -41,72 +37,68 @@ action = "%s"
 """
 
 
+@pytest.fixture
+def begin(sumo_runs):
+    """Return a function that begins an episode in a scenario of a network, traffic and a text."""
+
+    def begun(net, traffic, text):
+        simulator = sumo_runs.open(sumo_runs.write(net, f"<routes>{traffic}</routes>", {"scenario.toml": text}))
+        simulator.shown, _ = simulator.reset(seed=1, options={})
+        return simulator
+
+    return begun
+
+
 @pytest.mark.parametrize("action", ["continuous", "meta"])
 @pytest.mark.parametrize("options", ["", "lateral-resolution = 0.8"])
-def test_a_change_to_the_left_is_one(tmp_path, options, action):
-    shutil.copy(NET, tmp_path)
-    (tmp_path / "r.rou.xml").write_text('<routes><vType id="car" sigma="0" speedFactor="1"/></routes>')
-    (tmp_path / "scenario.toml").write_text(SCENARIO % (options, action))
-    stage = tmp_path / "stage"
-    stage.mkdir()
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
-        for side in (1, -1):
-            observations, *_ = simulator.reset(seed=1, options={})
-            before = observations["ego"][0]
-            y = simulator.scene().points[0][1]
-            form, step = simulator.actions["ego"], None
-            for number in range(40):
-                turn = number == 0
-                meant = (10.0, side if turn else 0) if action == "continuous" else (1 - side) if turn else 1
-                step = simulator.step({"ego": form.encode(meant)})
-            moved = simulator.scene().points[0][1] - y  # it drives towards x
-            assert 2.0 < side * moved < 3.3  # on the sublanes, most of it
-            shown = step[0]["ego"][0]
-            assert before[2] == pytest.approx(3.2)  # right of the leftmost lane, of three
-            assert shown[2] - before[2] == pytest.approx(-moved, abs=1e-3)
-
-
-def test_a_sidewalk_does_not_move_the_lanes_of_the_observation(tmp_path):
-    """The sidewalk is lane 0 and 2 m wide; the other lanes have 3.2 m."""
-    shutil.copy(NET.with_name("sidewalk.net.xml"), tmp_path / "left.net.xml")
-    (tmp_path / "r.rou.xml").write_text('<routes><vType id="car" sigma="0"/></routes>')
-    (tmp_path / "scenario.toml").write_text(SCENARIO.replace('"st"', '"e"') % ("", "continuous"))
-    stage = tmp_path / "stage"
-    stage.mkdir()
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
+def test_a_change_to_the_left_is_one(begin, options, action):
+    simulator = begin(NET, '<vType id="car" sigma="0" speedFactor="1"/>', SCENARIO % (options, action))
+    for side in (1, -1):
         observations, *_ = simulator.reset(seed=1, options={})
+        before = observations["ego"][0]
+        y = simulator.scene().points[0][1]
+        form, step = simulator.actions["ego"], None
+        for number in range(40):
+            turn = number == 0
+            meant = (10.0, side if turn else 0) if action == "continuous" else (1 - side) if turn else 1
+            step = simulator.step({"ego": form.encode(meant)})
+        moved = simulator.scene().points[0][1] - y  # it drives towards x
+        assert 2.0 < side * moved < 3.3  # on the sublanes, most of it
+        shown = step[0]["ego"][0]
+        assert before[2] == pytest.approx(3.2)  # right of the leftmost lane, of three
+        assert shown[2] - before[2] == pytest.approx(-moved, abs=1e-3)
+
+
+def test_a_sidewalk_does_not_move_the_lanes_of_the_observation(begin):
+    """The sidewalk is lane 0 and 2 m wide; the other lanes have 3.2 m."""
+    text = SCENARIO.replace('"st"', '"e"').replace("left.net", "sidewalk.net")
+    simulator = begin(NET.with_name("sidewalk.net.xml"), '<vType id="car" sigma="0"/>', text % ("", "continuous"))
+    assert simulator.shown["ego"][0][2] == pytest.approx(3.2)
+    for _ in range(20):
+        observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((10.0, 1))})
+        if observations["ego"][0][2] == 0:
+            break
         assert observations["ego"][0][2] == pytest.approx(3.2)
-        for _ in range(20):
-            observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode((10.0, 1))})
-            if observations["ego"][0][2] == 0:
-                break
-            assert observations["ego"][0][2] == pytest.approx(3.2)
-        assert observations["ego"][0][2] == 0
+    assert observations["ego"][0][2] == 0
 
 
 @pytest.mark.parametrize(("who", "lane", "side"), [("left ahead", "0", 1), ("right ahead", "2", -1)])
-def test_who_cuts_in_from_the_left_is_there(tmp_path, who, lane, side):
-    shutil.copy(NET, tmp_path)
-    traffic = '<vType id="car" sigma="0" speedFactor="1"/><route id="st" edges="st"/>' + "".join(
-        map(OTHER.format, "02")
+def test_who_cuts_in_from_the_left_is_there(begin, who, lane, side):
+    traffic = (
+        f'<vType id="car" sigma="0" speedFactor="1"/><route id="st" edges="st"/>{OTHER.format(0)}{OTHER.format(2)}'
     )
-    (tmp_path / "r.rou.xml").write_text(f"<routes>{traffic}</routes>")
-    (tmp_path / "scenario.toml").write_text(SCENARIO % ("", "continuous"))
-    stage = tmp_path / "stage"
-    stage.mkdir()
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
-        simulator.reset(seed=1, options={})
-        cut_in = Disturbance(1, who, "cut_in", 0.0, 2.0, "ego")
-        assert simulator.resolve_target(cut_in) == lane
-        scene = simulator.scene()
-        y = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
-        assert side * (y[lane] - y["ego"]) > 3.0  # it drives towards x
-        assert simulator.disturb(lane, cut_in) is not None
-        for _ in range(5):
-            simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
-        scene = simulator.scene()
-        after = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
-        assert after[lane] == after["ego"]
+    simulator = begin(NET, traffic, SCENARIO % ("", "continuous"))
+    cut_in = Disturbance(1, who, "cut_in", 0.0, 2.0, "ego")
+    assert simulator.resolve_target(cut_in) == lane
+    scene = simulator.scene()
+    y = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+    assert side * (y[lane] - y["ego"]) > 3.0  # it drives towards x
+    assert simulator.disturb(lane, cut_in) is not None
+    for _ in range(5):
+        simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
+    scene = simulator.scene()
+    after = dict(zip([actor.id for actor in scene.roster.actors], [y for _, y in scene.points], strict=True))
+    assert after[lane] == after["ego"]
 
 
 DRIVERS = """
@@ -139,31 +131,27 @@ action = "{action}"
     [("speed_and_lateral", [(10.0, 0.5), (10.0, -0.4)]), ("acceleration_steering", [(0.0, 0.01), (0.0, -0.008)])],
 )
 @pytest.mark.parametrize(("net", "edge"), [("left.net.xml", "st"), ("left-street.net.xml", "ab")])
-def test_left_is_left_in_offsets_and_drifts_also_of_a_road_with_one_lane(tmp_path, net, edge, action, answers):
-    shutil.copy(NET.with_name(net), tmp_path)
-    (tmp_path / "r.rou.xml").write_text("<routes/>")
-    (tmp_path / "scenario.toml").write_text(DRIVERS.format(net=net, edge=edge, action=action))
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path)) as simulator:
-        simulator.reset(seed=1, options={})
+def test_left_is_left_in_offsets_and_drifts_also_of_a_road_with_one_lane(begin, net, edge, action, answers):
+    simulator = begin(NET.with_name(net), "", DRIVERS.format(net=net, edge=edge, action=action))
 
-        def places():
-            scene = simulator.scene()
-            return [scene.points[scene.roster.index[agent]][1] for agent in ("ego", "ahead")]
+    def places():
+        scene = simulator.scene()
+        return [scene.points[scene.roster.index[agent]][1] for agent in ("ego", "ahead")]
 
-        begins = places()
-        for _ in range(8):
-            actions = {
-                agent: simulator.actions[agent].encode(answer)
-                for agent, answer in zip(("ego", "ahead"), answers, strict=True)
-            }
-            observations, *_ = simulator.step(actions)
-        moved = [y - begin for y, begin in zip(places(), begins, strict=True)]  # both drive towards x
-        assert moved[0] > 0.1
-        assert moved[1] < -0.1
-        shown = simulator.restore_observation("ego", observations["ego"])
-        columns = simulator.observation_layouts["ego"].columns
-        offsets = shown["ego"][columns["ego"]["lane_offset"]], shown["actors"][0, columns["actors"]["lane_offset"]]
-        assert offsets == pytest.approx(moved, abs=1e-6)
+    begins = places()
+    for _ in range(8):
+        actions = {
+            agent: simulator.actions[agent].encode(answer)
+            for agent, answer in zip(("ego", "ahead"), answers, strict=True)
+        }
+        observations, *_ = simulator.step(actions)
+    moved = [y - begin for y, begin in zip(places(), begins, strict=True)]  # both drive towards x
+    assert moved[0] > 0.1
+    assert moved[1] < -0.1
+    shown = simulator.restore_observation("ego", observations["ego"])
+    columns = simulator.observation_layouts["ego"].columns
+    offsets = shown["ego"][columns["ego"]["lane_offset"]], shown["actors"][0, columns["actors"]["lane_offset"]]
+    assert offsets == pytest.approx(moved, abs=1e-6)
 
 
 def test_long_vehicle_keeps_its_side_of_the_lane_in_a_bend(tmp_path):
@@ -193,25 +181,19 @@ def test_long_vehicle_keeps_its_side_of_the_lane_in_a_bend(tmp_path):
 
 @pytest.mark.parametrize("form", ["acceleration_steering", "speed_and_lateral"])
 @pytest.mark.parametrize("visible", ["front", "outline"])
-def test_vehicle_behind_reacts_to_the_part_of_ego_that_is_in_its_lane(tmp_path, form, visible):
-    shutil.copy(NET, tmp_path)
+def test_vehicle_behind_reacts_to_the_part_of_ego_that_is_in_its_lane(begin, form, visible):
     behind = '<vehicle id="behind" type="car" route="st" depart="0" departPos="15" departLane="2" departSpeed="12"/>'
-    (tmp_path / "r.rou.xml").write_text(
-        f'<routes><vType id="car" sigma="0" lcStrategic="-1" lcSpeedGain="0" lcKeepRight="0"/>'
-        f'<route id="st" edges="st"/>{behind}</routes>'
-    )
-    (tmp_path / "scenario.toml").write_text(SCENARIO % ("", f"{form}:visible={visible}"))
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path)) as simulator:
-        simulator.reset(seed=1, options={})
-        lanes = [libsumo.lane.getShape(f"st_{lane}")[0][1] for lane in (1, 2)]
-        right = 1.0 if lanes[1] < lanes[0] else -1.0  # lane 2 is to the right of ego
-        hits, encode = [], simulator.actions["ego"].encode
-        for step in range(120):
-            given = (8.0 if step < 15 else 0.0, -right if step < 15 else 0.0)
-            if form == "acceleration_steering":
-                motion, given = simulator._driving.moving["ego"], (0.0, 0.0)
-                motion.state = replace(motion.state, x=100.0, y=lanes[0] - 1.5 * right, heading=0.0, speed=0.0)
-            simulator.step({"ego": encode(given)})
-            hits += Overlap().check(simulator.scene(), ("ego",))
-        assert libsumo.vehicle.getLaneID("ego") == "st_1"
-        assert bool(hits) == (visible == "front")
+    kind = '<vType id="car" sigma="0" lcStrategic="-1" lcSpeedGain="0" lcKeepRight="0"/><route id="st" edges="st"/>'
+    simulator = begin(NET, kind + behind, SCENARIO % ("", f"{form}:visible={visible}"))
+    lanes = [libsumo.lane.getShape(f"st_{lane}")[0][1] for lane in (1, 2)]
+    right = 1.0 if lanes[1] < lanes[0] else -1.0  # lane 2 is to the right of ego
+    hits, encode = [], simulator.actions["ego"].encode
+    for step in range(120):
+        given = (8.0 if step < 15 else 0.0, -right if step < 15 else 0.0)
+        if form == "acceleration_steering":
+            motion, given = simulator._driving.moving["ego"], (0.0, 0.0)
+            motion.state = replace(motion.state, x=100.0, y=lanes[0] - 1.5 * right, heading=0.0, speed=0.0)
+        simulator.step({"ego": encode(given)})
+        hits += Overlap().check(simulator.scene(), ("ego",))
+    assert libsumo.vehicle.getLaneID("ego") == "st_1"
+    assert bool(hits) == (visible == "front")

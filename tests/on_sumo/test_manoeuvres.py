@@ -11,7 +11,6 @@ from onlookers import Steady
 
 from crashhunt.base.errors import InvalidEpisodeError, ScenarioError
 from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._options import SumoSetup
 from crashhunt.world import manoeuvre_motions
 
@@ -19,18 +18,12 @@ CUT_IN = {"ego_kmh": 60.0, "other_kmh": 40.0, "gap_m": 12.5, "lateral_mps": 0.9}
 
 
 @pytest.fixture
-def simulate(tmp_path):
-    made = []
-
+def simulate(sumo_runs):
     def begin(name, **arguments):
-        simulator = SumoSimulator(load_scenario(name), tmp_path)
-        made.append(simulator)
-        observations, _ = simulator.reset(seed=1, options={"arguments": arguments})
+        simulator, observations = sumo_runs.begin(name, 1, arguments)
         return simulator, observations["ego"]
 
-    yield begin
-    for simulator in made:
-        simulator.close()
+    return begin
 
 
 def drive(simulator, observation, agent, steps):

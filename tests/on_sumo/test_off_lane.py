@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import libsumo
@@ -11,11 +10,8 @@ import numpy as np
 import pytest
 from conftest import mostly_nightly
 
-from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, TooClose
-from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.sumo import SumoSetup, SumoSimulator
+from crashhunt.scenario import AgentSetup
 from crashhunt.trial import CRASHES, Disturbance, Outcome, TrialSpec
 
 pytestmark = pytest.mark.usefixtures("agents_may_command_sumo")
@@ -47,35 +43,21 @@ class Acts:
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(sumo_runs):
     """Runs an episode with the compiled core and without it; returns the result and the recording, which are equal."""
-    made = []
 
     def once(native, act, ego, traffic, more, options, steps, disturbances, speed_mode):
-        folder = tmp_path / f"scenario{len(made)}"
-        (folder / "stage").mkdir(parents=True)
-        shutil.copy(NET, folder)
         demand = sorted([ego, *traffic], key=lambda one: float(re.search("depart='([^']*)'", one)[1]))
-        (folder / "r.rou.xml").write_text(f"<routes>{HEAD}{''.join(demand)}</routes>")
-        (folder / "a.add.xml").write_text(PLACES.format(more=more))
-        files = {"net": NET.name, "routes": ("r.rou.xml",), "additional": ("a.add.xml",)}
-        scenario = Scenario(
-            step_length_s=0.1, warmup_s=0.0, folder=folder,
+        simulator = sumo_runs.written(
+            NET, f"<routes>{HEAD}{''.join(demand)}</routes>", additional=PLACES.format(more=more),
+            table={"options": options, "native": native}, step_length_s=0.1, warmup_s=0.0,
             agents={"ego": AgentSetup(existing=True, speed_mode=speed_mode)},
-            tables={"sumo": SumoSetup(**files, options=options, native=native)},
         )  # fmt: skip
-        simulator, box = SumoSimulator(scenario, folder / "stage"), BlackBox(folder / "box")
-        made.append((simulator, box))
-        box.begin(pid=1, trial=0, started=0.0)
         spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps, disturbances=disturbances)
-        result = run_episode(
-            spec, simulator=simulator, make_agent=lambda *_: Acts(act), box=box, crash_on=CRASHES,
-            oracles=[ReportedCollision(), Overlap(), OffRoad(), TooClose()],
-        )  # fmt: skip
-        recording = Recording(read_black_box(folder / "box"))
-        assert recording.digest == result.digest
+        oracles = [ReportedCollision(), Overlap(), OffRoad(), TooClose()]
+        found = sumo_runs.record(simulator, spec, Acts(act), oracles=oracles, crash_on=CRASHES)
         assert not simulator.notices
-        return result, recording
+        return found
 
     def run(act, ego, *, traffic=(), more="", options=None, steps=400, disturbances=(), speed_mode=31):
         given = act, ego, traffic, more, options or {}, steps, disturbances, speed_mode
@@ -85,10 +67,7 @@ def drive(tmp_path):
         assert str(result.danger) == str(plain.danger)
         return result, recording
 
-    yield run
-    for simulator, box in made:
-        simulator.close()
-        box.close()
+    return run
 
 
 def vehicle(inside="", **given):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from pathlib import Path
 
 import libsumo
@@ -15,7 +14,7 @@ from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.base.text import NOTICE_TOPIC
 from crashhunt.executors._protocol import Notes
 from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.sumo import BACKEND as SUMO, SumoSetup, SumoSimulator, _omitted_demand
+from crashhunt.sumo import BACKEND as SUMO, SumoSetup, _omitted_demand
 
 NET = Path(__file__).with_name("signal.net.xml")
 EGO = '<vehicle id="ego" route="across" depart="3"/>'
@@ -26,38 +25,31 @@ UNSORTED = f"""<routes><route id="across" edges="west east"/>
 
 
 @pytest.fixture
-def simulate(tmp_path):
+def simulate(sumo_runs):
     """Simulates some steps while standard error is a file, as in a trial; returns the simulator."""
-    made = []
 
-    def run(routes, agent="ego", steps=5, options=None):
-        folder = tmp_path / f"scenario{len(made)}"
-        (folder / "stage").mkdir(parents=True, exist_ok=True)
-        shutil.copy(NET, folder)
-        (folder / "r.rou.xml").write_text(routes)
+    def run(routes, agent="ego", steps=5, options=None, files=None):
+        folder = sumo_runs.write(NET, routes, files)
         sumo = SumoSetup(net=NET.name, routes=("r.rou.xml",), options=options or {})
         agents = {agent: AgentSetup(existing=True)}
-        scenario = Scenario(
-            step_length_s=0.5, insertion_timeout_s=5.0, agents=agents, tables={"sumo": sumo}, folder=folder
+        simulator = sumo_runs.open(
+            Scenario(step_length_s=0.5, insertion_timeout_s=5.0, agents=agents, tables={"sumo": sumo}, folder=folder)
         )
-        made.append(SumoSimulator(scenario, folder / "stage"))
         kept, output = os.dup(2), os.open(folder / "run.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(output, 2)
         os.write(2, b"Warning: Route file should be sorted by departure time, ignoring 'that of before'!\n")
         try:
-            made[-1].reset(seed=1)
+            simulator.reset(seed=1)
             for _ in range(steps):
                 libsumo.simulationStep()
-            made[-1].reported = list(made[-1].notices)
+            simulator.reported = list(simulator.notices)
         finally:
             os.dup2(kept, 2)
             os.close(output)
             os.close(kept)
-        return made[-1]
+        return simulator
 
-    yield run
-    for simulator in made:
-        simulator.close()
+    return run
 
 
 def test_omitted_demand_is_reported_with_reason_and_place(simulate, monkeypatch):
@@ -74,7 +66,7 @@ def test_omitted_demand_is_reported_with_reason_and_place(simulate, monkeypatch)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_note_names_what_sumo_leaves_out(simulate, tmp_path, seed):
+def test_note_names_what_sumo_leaves_out(simulate, seed):
     """In files of any order, with times in each notation; with includes, which SUMO reads in their place."""
     rng = np.random.default_rng(seed)
     walk = '<walk edges="west"/>'
@@ -91,14 +83,14 @@ def test_note_names_what_sumo_leaves_out(simulate, tmp_path, seed):
         return kinds[int(rng.integers(0, len(kinds)))].replace('"triggered"', f'"{time}"')
 
     demand = [element(number) for number in range(12)]
-    (tmp_path / "scenario0").mkdir()
-    (tmp_path / "scenario0" / "more.rou.xml").write_text(f"<routes>{''.join(demand[4:8])}</routes>")
+    files = {"more.rou.xml": f"<routes>{''.join(demand[4:8])}</routes>"}
     demand[4:8] = ['<include href="more.rou.xml"/>']
     head = '<routes><route id="across" edges="west east"/><vehicle id="ego" route="across" depart="0"/>'
-    simulator = simulate(f"{head}{''.join(demand)}</routes>", steps=100)
-    said = re.findall(r"ignoring '(\d+)'!", (tmp_path / "scenario0" / "run.log").read_text())
+    simulator = simulate(f"{head}{''.join(demand)}</routes>", steps=100, files=files)
+    folder = simulator._scenario.folder
+    said = re.findall(r"ignoring '(\d+)'!", (folder / "run.log").read_text())
     late = []
-    _omitted_demand._search(tmp_path / "scenario0" / "r.rou.xml", 0.0, [0.0], late)
+    _omitted_demand._search(folder / "r.rou.xml", 0.0, [0.0], late)
     assert [name.split("'")[1] for name, _ in late] == said
     assert said
     (note,) = [note for note in SUMO.notes(simulator._scenario) if "sorted" in note]

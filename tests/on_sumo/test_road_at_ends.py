@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 libsumo = pytest.importorskip("libsumo")
 
-from crashhunt.scenario import argument_values, load_scenario  # noqa: E402
+from crashhunt.scenario import argument_values  # noqa: E402
 
 PARTS = ("lanes", "route", "route_state", "signals", "right_of_way", "stop_line", "speed_limit")
 
 
 @pytest.fixture
-def start(tmp_path):
-    from crashhunt.sumo import SumoSimulator
-
-    made = []
-
+def start(sumo_runs):
     def begin(name, parts=PARTS, only=None):
-        scenario = load_scenario(name)
-        setups = {agent: replace(setup, observation=parts) for agent, setup in scenario.agents.items()}
-        scenario = replace(scenario, agents=setups)
-        made.append(SumoSimulator(scenario, tmp_path))
-        shown, _ = made[0].reset(seed=2, options={"arguments": argument_values(scenario), "only": only})
-        return made[0], shown
+        simulator = sumo_runs.open(name, observation=parts)
+        shown, _ = simulator.reset(seed=2, options={"arguments": argument_values(simulator._scenario), "only": only})
+        return simulator, shown
 
-    yield begin
-    made[0].close()
+    return begin
 
 
 def parts_of(simulator, shown):

@@ -12,7 +12,6 @@ import pytest
 libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
 
-from crashhunt.scenario import argument_values, load_scenario  # noqa: E402
 from crashhunt.sumo._lane_graph import VEHICLE_CLASSES, LaneGraph  # noqa: E402
 from crashhunt.sumo.maps import read_network  # noqa: E402
 from crashhunt.world import lane_lines  # noqa: E402
@@ -165,22 +164,15 @@ def test_a_route_that_no_lane_leads_along_is_followed_as_far_as_it_goes():
     assert graph.guide((), CAR).road_map(0, None).reference_path.shape == (0, 2)
 
 
-def test_the_simulator_gives_the_map_and_the_vehicle_of_the_present_route(tmp_path):
-    from crashhunt.sumo import SumoSimulator
-
-    scenario = load_scenario("loop")
-    simulator = SumoSimulator(scenario, tmp_path)
-    try:
-        simulator.reset(seed=1, options={"arguments": argument_values(scenario)})
-        road, vehicle = simulator.road_map("ego"), simulator.vehicle_data("ego")
-        assert simulator.road_map("ego").lanes is road.lanes
-        assert road.route[0] == libsumo.vehicle.getLaneID("ego")
-        edges = libsumo.vehicle.getRoute("ego")[libsumo.vehicle.getRouteIndex("ego") :]
-        roads = [road.lanes[one].road for one in road.route if not one.startswith(":")]
-        assert [one for place, one in enumerate(roads) if not place or one != roads[place - 1]] == list(edges)
-        assert (vehicle.length, vehicle.width) == (libsumo.vehicle.getLength("ego"), libsumo.vehicle.getWidth("ego"))
-        assert 0.0 < vehicle.rear_axle_offset < vehicle.wheelbase < vehicle.length
-        assert vehicle.max_deceleration <= vehicle.emergency_deceleration
-        assert vehicle.kind == CAR
-    finally:
-        simulator.close()
+def test_the_simulator_gives_the_map_and_the_vehicle_of_the_present_route(sumo_runs):
+    simulator, _ = sumo_runs.begin("loop", 1)
+    road, vehicle = simulator.road_map("ego"), simulator.vehicle_data("ego")
+    assert simulator.road_map("ego").lanes is road.lanes
+    assert road.route[0] == libsumo.vehicle.getLaneID("ego")
+    edges = libsumo.vehicle.getRoute("ego")[libsumo.vehicle.getRouteIndex("ego") :]
+    roads = [road.lanes[one].road for one in road.route if not one.startswith(":")]
+    assert [one for place, one in enumerate(roads) if not place or one != roads[place - 1]] == list(edges)
+    assert (vehicle.length, vehicle.width) == (libsumo.vehicle.getLength("ego"), libsumo.vehicle.getWidth("ego"))
+    assert 0.0 < vehicle.rear_axle_offset < vehicle.wheelbase < vehicle.length
+    assert vehicle.max_deceleration <= vehicle.emergency_deceleration
+    assert vehicle.kind == CAR

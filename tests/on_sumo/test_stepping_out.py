@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import resource
-import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from onlookers import Steady, Watch
 
 from crashhunt.episode import Episode
 from crashhunt.oracles import Overlap
-from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator, _simulator
+from crashhunt.scenario import AgentSetup
+from crashhunt.sumo import _simulator
 from crashhunt.sumo._disturbances import JunctionLanes, SteppingOut, _between, _nearest, can_step_out
 from crashhunt.trial import Disturbance, Outcome, TrialSpec
 
@@ -31,21 +30,14 @@ EGO = '<vehicle id="ego" depart="0" departPos="10" departSpeed="10"><route edges
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(sumo_runs):
     """Runs an episode on a straight road with a sidewalk; returns its result and who watched."""
-    made = []
 
     def run(traffic, *disturbances, net="sidewalk", speed=5.0, steps=120, strength=None):
-        folder = tmp_path / f"s{len(made)}"
-        (folder / "stage").mkdir(parents=True)
-        shutil.copy(NETS / f"{net}.net.xml", folder / "n.net.xml")
-        (folder / "r.rou.xml").write_text(f"<routes>{traffic}</routes>")
-        (folder / "scenario.toml").write_text(
-            'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = 0.1\nwarmup_s = 0.0\n'
-            '[sumo]\nnet = "n.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nexisting = true\n'
-        )
-        simulator = SumoSimulator(load_scenario(folder), folder / "stage")
-        made.append(simulator)
+        simulator = sumo_runs.written(
+            NETS / f"{net}.net.xml", f"<routes>{traffic}</routes>", step_length_s=0.1, warmup_s=0.0,
+            agents={"ego": AgentSetup(existing=True)},
+        )  # fmt: skip
         watch = Watch()
         spec = TrialSpec(0, 1, {}, strength or {}, steps, disturbances=disturbances)
         with Episode(spec, simulator=simulator, make_agent=lambda *_: Steady(speed), observers=(watch,)) as episode:
@@ -55,9 +47,7 @@ def drive(tmp_path):
         assert episode.result.failure is None, episode.result.failure
         return episode.result, watch
 
-    yield run
-    for simulator in made:
-        simulator.close()
+    return run
 
 
 def stepping(step, strong=1.4, long=6.0, who="right ahead"):

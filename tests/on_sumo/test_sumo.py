@@ -14,7 +14,7 @@ import pytest
 from crashhunt.base.errors import InvalidEpisodeError
 from crashhunt.oracles import OffRoad
 from crashhunt.recording import read_log
-from crashhunt.scenario import argument_values, load_scenario, shipped_folder
+from crashhunt.scenario import load_scenario, shipped_folder
 from crashhunt.sumo import SumoSimulator
 
 
@@ -131,15 +131,14 @@ def test_a_malformed_network_is_no_crash(town, damage):
 
 
 @pytest.mark.parametrize(("form", "action", "leaves"), [("", (8.0, 1), True), ("meta", 0, False)])
-def test_second_change_to_the_left_leaves_two_lanes_and_is_ignored_in_the_discrete_form(tmp_path, form, action, leaves):
-    scenario = load_scenario("loop")
-    scenario = replace(scenario, agents={"ego": replace(scenario.agents["ego"], action=form)})
-    with closing(SumoSimulator(scenario, tmp_path)) as simulator:
-        simulator.reset(seed=4, options={"arguments": {**argument_values(scenario), "vehicles": 10}})
-        steps = 0
-        while not (left := OffRoad().check(simulator.scene(), ("ego",))) and steps < 60:
-            seen, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
-            steps += 1
+def test_second_change_to_the_left_leaves_two_lanes_and_is_ignored_in_the_discrete_form(
+    sumo_runs, form, action, leaves
+):
+    simulator, _ = sumo_runs.begin("loop", 4, {"vehicles": 10}, action=form)
+    steps = 0
+    while not (left := OffRoad().check(simulator.scene(), ("ego",))) and steps < 60:
+        seen, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
+        steps += 1
     assert (steps < 4, [(found.outcome, found.collision.role) for found in left]) == (
         leaves,
         [("off_road", "alone")] * leaves,
@@ -165,15 +164,12 @@ def test_two_agents_have_channels_and_arguments_of_their_own(shell):
     assert "keeper=keep-lane" in done.err
 
 
-def test_ego_sees_its_own_speed_which_changes_within_the_limits_of_its_type(tmp_path):
-    scenario = load_scenario("loop")
-    with closing(SumoSimulator(scenario, tmp_path)) as simulator:
-        seen, _ = simulator.reset(seed=2, options={"arguments": argument_values(scenario)})
-        speeds = []
-        while not simulator.scene().contacts:
-            scene = simulator.scene()
-            speeds.append(scene.speeds[scene.roster.index["ego"]])
-            assert seen["ego"][0, 3] == pytest.approx(speeds[-1])
-            seen, *_ = simulator.step({"ego": simulator.actions["ego"].encode((25.0, 0))})
+def test_ego_sees_its_own_speed_which_changes_within_the_limits_of_its_type(sumo_runs):
+    simulator, seen = sumo_runs.begin("loop", 2)
+    speeds = []
+    while not (scene := simulator.scene()).contacts:
+        speeds.append(scene.speeds[scene.roster.index["ego"]])
+        assert seen["ego"][0, 3] == pytest.approx(speeds[-1])
+        seen, *_ = simulator.step({"ego": simulator.actions["ego"].encode((25.0, 0))})
     assert len(speeds) > 40
     assert np.all(np.abs(np.diff(speeds)) <= 0.1 * 9.0 + 1e-6)  # physical limits hold: speed mode 6

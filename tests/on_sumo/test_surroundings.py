@@ -13,14 +13,8 @@ from crashhunt.scenario import argument_values, load_scenario
 
 
 @pytest.fixture
-def merge(tmp_path):
-    from crashhunt.sumo import SumoSimulator
-
-    scenario = load_scenario("merge")
-    simulator = SumoSimulator(scenario, tmp_path)
-    simulator.reset(seed=3, options={"arguments": argument_values(scenario)})
-    yield simulator
-    simulator.close()
+def merge(sumo_runs):
+    return sumo_runs.begin("merge", 3)[0]
 
 
 def apart(scene, one, other):

@@ -14,8 +14,6 @@ libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
 
 import crashhunt.guide  # noqa: E402
-from crashhunt.episode import run_episode  # noqa: E402
-from crashhunt.recording import BlackBox  # noqa: E402
 from crashhunt.scenario import argument_values, load_scenario  # noqa: E402
 from crashhunt.sumo._observing import ObservedParts  # noqa: E402
 from crashhunt.trial import TrialSpec  # noqa: E402
@@ -151,35 +149,23 @@ HITS = {("grid-lights", 1), ("stops", 2), ("left-grid", 5)}
 @pytest.mark.parametrize(
     ("name", "seed", "share"), [("grid-lights", 1, 0.2), pytest.param("allway", 2, 1.0, marks=pytest.mark.nightly)]
 )
-def test_compiled_core_writes_the_observations_of_the_driver_like_python(name, seed, share, tmp_path, monkeypatch):
-    from crashhunt.sumo import SumoSetup, SumoSimulator
+def test_compiled_core_writes_the_observations_of_the_driver_like_python(name, seed, share, sumo_runs, monkeypatch):
+    from crashhunt.sumo import SumoSetup
 
     kind = page_driver()
     observe, calls, found = ObservedParts.observe, [], []
     monkeypatch.setattr(ObservedParts, "observe", lambda *given: calls.append(1) or observe(*given))
     for native in (None, False):
         calls.clear()
-        folder = tmp_path / f"native-{native}"
-        (folder / "stage").mkdir(parents=True)
-        scenario = town(name, folder, kind.observation, seed)
+        scenario = town(name, sumo_runs.folder(), kind.observation, seed)
         scenario = scenario.with_table(replace(scenario.table(SumoSetup), native=native))
-        simulator, box = SumoSimulator(scenario, folder / "stage"), BlackBox(folder / "box.bin")
-        box.begin(pid=1, trial=0, started=0.0)
-        columns = simulator.observation_layouts["ego"].columns
+        simulator = sumo_runs.open(scenario)
+        agent = kind(simulator.observation_layouts["ego"].columns)
         spec = TrialSpec(0, seed, {}, argument_values(scenario), max_steps=400)
-        result = run_episode(
-            spec,
-            simulator=simulator,
-            make_agent=lambda *_, known=columns: kind(known),
-            box=box,
-            oracles=[],
-            crash_on=(),
-        )
+        result, _ = sumo_runs.record(simulator, spec, agent, oracles=[], crash_on=())
         found.append((result.digest, result.steps))
         # Without the core, Python reads each step; with it, only the parts and steps that the core does not write.
         assert len(calls) == result.steps + 1 if native is False else len(calls) <= share * result.steps
-        simulator.close()
-        box.close()
     assert found[0] == found[1]
     assert found[0][1] > 150
 

@@ -18,11 +18,12 @@ from crashhunt.agents import CarFollowing
 from crashhunt.episode import SIGNALS as KNOWN_SIGNALS, Episode, TrialSignals
 from crashhunt.oracles import Overlap, RequirementOracle
 from crashhunt.requirements import TRAFFIC_RULES, parse
-from crashhunt.scenario import argument_values, load_scenario
+from crashhunt.scenario import AgentSetup, argument_values, load_scenario
 from crashhunt.sumo import SumoSimulator
 from crashhunt.trial import Outcome, TrialSpec
 
 ROOT = Path(__file__).parents[2]
+SIGNAL = Path(__file__).with_name("signal.net.xml")
 SIGNALS = sorted({name for rule in TRAFFIC_RULES.values() for name in parse(rule.formula).signals})
 
 
@@ -225,21 +226,14 @@ def test_priority_is_that_of_the_network_file_and_of_the_geometry_of_the_lanes(r
 
 
 @pytest.mark.parametrize("lane", [0, 1])
-def test_red_light_is_that_of_the_program_in_the_network_file(lane, tmp_path):
-    net = (ROOT / "tests" / "on_sumo" / "signal.net.xml").read_text()
+def test_red_light_is_that_of_the_program_in_the_network_file(lane, sumo_runs):
+    net = SIGNAL.read_text()
     phases = [(float(s), state) for s, state in re.findall(r'<phase duration="([^"]+)"\s+state="([^"]+)"', net)]
     link = int(re.search(rf'from="west" to="east" fromLane="{lane}" .*?linkIndex="(\d+)"', net)[1])
     length_m = float(re.search(rf'<lane id="west_{lane}".*?length="([^"]+)"', net)[1])
-    (tmp_path / "n.net.xml").write_text(net)
-    (tmp_path / "r.rou.xml").write_text(
-        f'<routes><vehicle id="ego" depart="0" departPos="0" departLane="{lane}"><route edges="west east"/>'
-        "</vehicle></routes>"
-    )
-    (tmp_path / "scenario.toml").write_text(
-        'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = 0.5\nwarmup_s = 0.0\n'
-        '[sumo]\nnet = "n.net.xml"\nroutes = ["r.rou.xml"]\n[agents.ego]\nexisting = true\n'
-    )
-    simulator = SumoSimulator(load_scenario(tmp_path), tmp_path)
+    ego = f'<vehicle id="ego" depart="0" departPos="0" departLane="{lane}"><route edges="west east"/></vehicle>'
+    agents = {"ego": AgentSetup(existing=True)}
+    simulator = sumo_runs.written(SIGNAL, f"<routes>{ego}</routes>", step_length_s=0.5, warmup_s=0.0, agents=agents)
     compared = {True: 0, False: 0}
     with Episode(
         TrialSpec(0, 1, {}, {}, 200), simulator=simulator, make_agent=lambda *_: Crawls(), crash_on=()
@@ -258,7 +252,6 @@ def test_red_light_is_that_of_the_program_in_the_network_file(lane, tmp_path):
             assert row[0] == pytest.approx(expected, abs=1e-6)
             compared[expected < math.inf] += 1
             result = episode.step()
-    simulator.close()
     assert min(compared.values()) > 10
 
 
@@ -269,9 +262,9 @@ class Crawls(Hectic):
         return 1.2, 0
 
 
-def test_every_listed_signal_of_a_scene_is_what_libsumo_answers(tmp_path):
+def test_every_listed_signal_of_a_scene_is_what_libsumo_answers(sumo_runs):
     scenario = load_scenario("merge")
-    simulator, step_s, get = SumoSimulator(scenario, tmp_path), scenario.step_length_s, libsumo.vehicle
+    simulator, step_s, get = sumo_runs.open(scenario), scenario.step_length_s, libsumo.vehicle
     spec, rows, expected = TrialSpec(0, 4, {}, argument_values(scenario), 120), [], []
     with Episode(spec, simulator=simulator, make_agent=lambda *_: Hectic(), crash_on=()) as episode:
         result = episode.start()
@@ -295,7 +288,6 @@ def test_every_listed_signal_of_a_scene_is_what_libsumo_answers(tmp_path):
                 "clearance_m": min((apart("ego", one) for one in others), default=math.inf),
             })  # fmt: skip
             result = episode.step()
-    simulator.close()
     found = {name: np.array(values, float) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
     known = {name: np.array([one[name] for one in expected]) for name in expected[0]}
     speeds, gaps = known["speed"], known["gap_m"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,12 +14,10 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 from crashhunt.crashes import Encounter
-from crashhunt.episode import run_episode
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
-from crashhunt.recording import BlackBox, Recording, first_divergence, read_black_box, read_log, write_log
+from crashhunt.recording import first_divergence, read_log, write_log
 from crashhunt.render import SceneView
-from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.sumo import SumoSimulator
+from crashhunt.scenario import AgentSetup, ObservationSetup
 from crashhunt.sumo._bent_vehicles import height_at
 from crashhunt.trial import Outcome, TrialSpec
 from crashhunt.world import approaches, outlines, outlines_overlap
@@ -44,41 +41,21 @@ class Constant:
 
 
 @pytest.fixture
-def drive(tmp_path):
+def drive(sumo_runs):
     """Runs one episode in this process; returns the result."""
-    simulators = []
 
-    def run(net, routes, *, speed=15.0, steps=300, step_s=0.1, options="", ego="existing = true", observation=""):
-        folder = tmp_path / f"{len(simulators)}"
-        folder.mkdir()
-        shutil.copy(NETS / f"{net}.net.xml", folder)
-        (folder / "r.rou.xml").write_text(f"<routes>{routes}</routes>")
-        (folder / "scenario.toml").write_text(
-            f'title = "t"\nschema = 1\nsimulator = "sumo"\nstep_length_s = {step_s}\nwarmup_s = 0.0\n'
-            f'[sumo]\nnet = "{net}.net.xml"\nroutes = ["r.rou.xml"]\noptions = {{ {options} }}\n'
-            f"[agents.ego]\n{ego}\n[observation]\n{observation}\n"
-        )
-        scenario = load_scenario(folder)
-        stage = folder / "stage"
-        stage.mkdir()
-        simulators.append(SumoSimulator(scenario, stage))
-        box = BlackBox(folder / "box")
-        box.begin(pid=0, trial=0, started=0.0)
+    def run(net, routes, *, speed=15.0, steps=300, step_s=0.1, options=None, observation=None):
+        simulator = sumo_runs.written(
+            NETS / f"{net}.net.xml", f"<routes>{routes}</routes>", table={"options": options or {}},
+            step_length_s=step_s, warmup_s=0.0, agents={"ego": AgentSetup(existing=True)}, observation=observation,
+        )  # fmt: skip
         agent = Constant(speed)
-        result = run_episode(
-            TrialSpec(0, 1, {}, argument_values(scenario), steps),
-            simulator=simulators[-1],
-            make_agent=lambda *_: agent,
-            box=box,
-            oracles=(ReportedCollision(), Overlap(), OffRoad()),
-        )
-        box.close()
+        oracles = (ReportedCollision(), Overlap(), OffRoad())
+        result, recording = sumo_runs.record(simulator, TrialSpec(0, 1, {}, {}, steps), agent, oracles=oracles)
         assert result.outcome is not Outcome.INVALID, result.failure
-        return result, Recording(read_black_box(folder / "box")), agent
+        return result, recording, agent
 
-    yield run
-    for simulator in simulators:
-        simulator.close()
+    return run
 
 
 def vehicle(name, edges, *, kind="", **attributes):
@@ -221,8 +198,8 @@ def test_a_person_in_the_lane_is_seen_and_hit(drive, tmp_path):
         + '<person id="9" type="cyclist" depart="0" departPos="90"><walk edges="wc ce"/></person>'
         + '<person id="rider" depart="0"><ride from="wc" to="ce" lines="ego"/></person>'
     )
-    names = '["presence", "x", "y", "kind"]'
-    result, recording, agent = drive("street", traffic, speed=10.0, observation=f"features = {names}")
+    observation = ObservationSetup(features=("presence", "x", "y", "kind"))
+    result, recording, agent = drive("street", traffic, speed=10.0, observation=observation)
     hit = result.collision
     assert (result.outcome, hit.role, hit.collider, hit.victim) == (
         Outcome.COLLISION, "collider", "ego", "person ego",
@@ -262,7 +239,7 @@ def test_persons_inside_of_vehicles_and_ghosts_are_no_actors(drive):
     assert {"ego", "taxi", "person walker"} <= set(recording.scene(60).roster.index)
     assert "person rider" not in recording.scene(60).roster.index
     # In this model they walk through vehicles, in the middle of the lane.
-    _, recording, _ = drive("street", traffic, steps=60, options='"pedestrian.model" = "nonInteracting"')
+    _, recording, _ = drive("street", traffic, steps=60, options={"pedestrian.model": "nonInteracting"})
     assert sorted(actor.id for actor in recording.actors) == ["ego", "taxi"]
 
 
