@@ -13,7 +13,6 @@ from conftest import examples
 from hypothesis import given, settings, strategies as some
 
 from crashhunt.agents import KeepLaneWithSpeed
-from crashhunt.episode import run_episode
 from crashhunt.native import _core, core_for, why_not
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision
 from crashhunt.oracles._included_oracles import _within_reach
@@ -551,31 +550,19 @@ LIES = {
 
 
 @pytest.fixture
-def run(tmp_path):
-    from crashhunt.sumo import SumoSimulator
-
+def run(sumo_runs):
     def trial(scenario, *, native, steps=60, lie=None, speed=15.0, seed=5, parts=(), agent=None):
         chosen = load_scenario(scenario)
         if parts:
-            agents = {
-                agent: replace(setup, observation=parts, action="continuous") for agent, setup in chosen.agents.items()
-            }
-            chosen = replace(chosen, agents=agents)
-        chosen = chosen.with_table(replace(chosen.table(SumoSetup), native=native))
-        stage = tmp_path / f"stage-{native}-{lie}"
-        stage.mkdir()
-        simulator = SumoSimulator(chosen, stage)
+            setups = {name: replace(one, observation=parts, action="continuous") for name, one in chosen.agents.items()}
+            chosen = replace(chosen, agents=setups)
+        simulator = sumo_runs.open(chosen.with_table(replace(chosen.table(SumoSetup), native=native)))
         assert (simulator._sight.core is core) == (native is None)
         if lie is not None and LIES[lie] is not None:
             simulator._sight.core = _Lies(lie.partition(",")[0], LIES[lie])
-        box = BlackBox(stage / "box.bin")
-        box.begin(pid=1, trial=0, started=0.0)
-        agents = {"make_agent": lambda *_: agent or KeepLaneWithSpeed(speed), "crash_on": CRASHES}
-        spec = TrialSpec(0, seed, {}, argument_values(chosen), max_steps=steps)
-        oracles = [ReportedCollision(), Overlap(), OffRoad()]
-        result = run_episode(spec, simulator=simulator, box=box, oracles=oracles, **agents)
-        simulator.close()
-        box.close()
+        driver, oracles = agent or KeepLaneWithSpeed(speed), [ReportedCollision(), Overlap(), OffRoad()]
+        spec = TrialSpec(0, seed, {}, argument_values(chosen), steps)
+        result, _ = sumo_runs.record(simulator, spec, driver, oracles=oracles, crash_on=CRASHES)
         return replace(result, setup_s=0.0, wall_s=0.0), simulator
 
     return trial

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.native import _generators, reseed_generators, why_no_reseeding
-from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.sumo import SumoSimulator
+from crashhunt.scenario import argument_values
 
 BYTES = _generators._GENERATOR_BYTES
 
@@ -109,19 +108,15 @@ def test_reason_names_the_version_or_the_missing_symbol(monkeypatch):
     assert "undefined symbol: _ZN6MSLane6myRNGsE" in why_no_reseeding("1.28.0", python)
 
 
-def test_running_simulation_has_the_seeds_and_continues_by_them(tmp_path):
-    scenario = load_scenario("loop")
-    simulator = SumoSimulator(scenario, tmp_path)
+def test_running_simulation_has_the_seeds_and_continues_by_them(sumo_runs):
+    simulator = sumo_runs.open("loop")
     if simulator.why_no_reseeding:
         pytest.skip(simulator.why_no_reseeding)
-    try:
-        speeds = []
-        for seed in (7, 7, 8):
-            simulator.reset(seed=1, options={"arguments": argument_values(scenario)})
-            simulator.reseed(seed)
-            for _ in range(20):
-                simulator.step({"ego": simulator.actions["ego"].encode((8.0, 0))})
-            speeds.append(list(simulator.scene().speeds))
-        assert speeds[0] == speeds[1] != speeds[2]
-    finally:
-        simulator.close()
+    speeds = []
+    for seed in (7, 7, 8):
+        simulator.reset(seed=1, options={"arguments": argument_values(simulator._scenario)})
+        simulator.reseed(seed)
+        for _ in range(20):
+            simulator.step({"ego": simulator.actions["ego"].encode((8.0, 0))})
+        speeds.append(list(simulator.scene().speeds))
+    assert speeds[0] == speeds[1] != speeds[2]

@@ -223,9 +223,7 @@ def sumo_scenario(folder: Path, **table: object):
 def simulator(folder: Path, **table: object):
     from crashhunt.sumo import SumoSimulator
 
-    stage = folder / "stage"
-    stage.mkdir()
-    return closing(SumoSimulator(sumo_scenario(folder, **table), stage))
+    return closing(SumoSimulator(sumo_scenario(folder, **table), folder))
 
 
 @needs_library

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import math
 import random
-from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -13,10 +12,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from crashhunt.scenario import AgentSetup
+
 libsumo = pytest.importorskip("libsumo")
 
-from crashhunt.scenario import load_scenario  # noqa: E402
-from crashhunt.sumo import SumoSimulator  # noqa: E402
 
 NETS = Path(__file__).parent / "nets"
 NIGHTLY = ("allway", "grid-lights", "grid-skew", "left-grid")
@@ -152,7 +151,7 @@ def rows_wanted(network, own, line, agent, other):
 
 
 @pytest.mark.parametrize("name", ["roundabout", *(pytest.param(one, marks=pytest.mark.nightly) for one in NIGHTLY)])
-def test_right_of_way_is_that_of_the_network_files_bits_and_of_all_actors_near(name, tmp_path):
+def test_right_of_way_is_that_of_the_network_files_bits_and_of_all_actors_near(name, sumo_runs):
     """Several agents that SUMO drives, each with all vehicles around it, also those inside junctions upstream."""
     content, draw = gzip.decompress((NETS / f"{name}.net.xml.gz").read_bytes()), random.Random(3)
     network = Network(content)
@@ -160,55 +159,48 @@ def test_right_of_way_is_that_of_the_network_files_bits_and_of_all_actors_near(n
     for number in range(VEHICLES):
         vehicle = f'<vehicle id="v{number}" depart="{number}" departLane="best" departSpeed="max">'
         rows.append(f'{vehicle}<route edges="{network.walk(draw, 30)}"/></vehicle>')
-    (tmp_path / "r.rou.xml").write_text(f"<routes>{''.join(rows)}</routes>")
-    (tmp_path / "n.net.xml").write_bytes(content)
-    agents = "".join(
-        f'[agents.a{number}]\nroute = "q{number}"\naction = "sumo"\nobservation = ["right_of_way:rows=60"]\n'
+    agents = {
+        f"a{number}": AgentSetup(route=f"q{number}", action="sumo", observation=("right_of_way:rows=60",))
         for number in range(AGENTS)
-    )
-    (tmp_path / "scenario.toml").write_text(
-        'schema = 1\nsimulator = "sumo"\nstep_length_s = 0.2\nwarmup_s = 30.0\n'
-        f'[sumo]\nnet = "n.net.xml"\nroutes = ["r.rou.xml"]\n{agents}'
-    )
-    stage = tmp_path / "stage"
-    stage.mkdir()
+    }
+    routes, net = f"<routes>{''.join(rows)}</routes>", NETS / f"{name}.net.xml.gz"
+    simulator = sumo_runs.written(net, routes, step_length_s=0.2, warmup_s=30.0, agents=agents)
     seen = {"exact": 0, "upstream": 0, "yields": 0}
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), stage)) as simulator:
-        observations, _ = simulator.reset(seed=2, options={})
-        for _ in range(STEPS):
-            there = [one for one in libsumo.vehicle.getIDList() if libsumo.vehicle.getLaneID(one)]
-            speeds = {one: max(0.0, libsumo.vehicle.getSpeed(one)) for one in there}
-            for agent in simulator.agents:
-                shown = simulator.restore_observation(agent, observations[agent])["right_of_way"]
-                shown = [one.tolist() for one in shown if one[0]]
-                assert [one[6] for one in shown] == sorted(one[6] for one in shown)
-                ways, line, on_way = next(network.ahead(agent), ([], 0.0, False))
-                if not on_way or len(ways) > 1:
+    observations, _ = simulator.reset(seed=2, options={})
+    for _ in range(STEPS):
+        there = [one for one in libsumo.vehicle.getIDList() if libsumo.vehicle.getLaneID(one)]
+        speeds = {one: max(0.0, libsumo.vehicle.getSpeed(one)) for one in there}
+        for agent in simulator.agents:
+            shown = simulator.restore_observation(agent, observations[agent])["right_of_way"]
+            shown = [one.tolist() for one in shown if one[0]]
+            assert [one[6] for one in shown] == sorted(one[6] for one in shown)
+            ways, line, on_way = next(network.ahead(agent), ([], 0.0, False))
+            if not on_way or len(ways) > 1:
+                continue
+            (own,) = ways
+            for other in there:
+                wanted = rows_wanted(network, own, line, agent, other) if other != agent else ()
+                found = next(
+                    (
+                        row
+                        for row in shown
+                        for yields, distance, away, most in wanted
+                        if row[5] == speeds[other] and yields in (None, row[1])
+                        and abs(row[3] - distance) < most and abs(row[4] - away) < most
+                    ),
+                    None,
+                )  # fmt: skip
+                if found is None:
+                    apart = math.dist(libsumo.vehicle.getPosition(agent), libsumo.vehicle.getPosition(other))
+                    assert not wanted or apart > SURE_M, (agent, other, wanted, shown)
                     continue
-                (own,) = ways
-                for other in there:
-                    wanted = rows_wanted(network, own, line, agent, other) if other != agent else ()
-                    found = next(
-                        (
-                            row
-                            for row in shown
-                            for yields, distance, away, most in wanted
-                            if row[5] == speeds[other] and yields in (None, row[1])
-                            and abs(row[3] - distance) < most and abs(row[4] - away) < most
-                        ),
-                        None,
-                    )  # fmt: skip
-                    if found is None:
-                        apart = math.dist(libsumo.vehicle.getPosition(agent), libsumo.vehicle.getPosition(other))
-                        assert not wanted or apart > SURE_M, (agent, other, wanted, shown)
-                        continue
-                    shown.remove(found)
-                    seen["exact" if wanted[0][3] == TOLERANCE_M else "upstream"] += 1
-                    seen["yields"] += found[1] > 0
-                    assert found[2] == pytest.approx(line)
-                    assert found[7] == (own.state in "sw")
-                    arrival = max(0.0, found[4]) / max(found[5], 1e-9) if found[5] > 0.1 or found[4] <= 0 else 1000.0
-                    assert found[6] == pytest.approx(min(1000.0, arrival))
-                assert all(one[4] > SURE_ROAD_M - OTHER_LANE_M for one in shown), (agent, shown)
-            observations, *_ = simulator.step({one: simulator.actions[one].encode(None) for one in simulator.agents})
+                shown.remove(found)
+                seen["exact" if wanted[0][3] == TOLERANCE_M else "upstream"] += 1
+                seen["yields"] += found[1] > 0
+                assert found[2] == pytest.approx(line)
+                assert found[7] == (own.state in "sw")
+                arrival = max(0.0, found[4]) / max(found[5], 1e-9) if found[5] > 0.1 or found[4] <= 0 else 1000.0
+                assert found[6] == pytest.approx(min(1000.0, arrival))
+            assert all(one[4] > SURE_ROAD_M - OTHER_LANE_M for one in shown), (agent, shown)
+        observations, *_ = simulator.step({one: simulator.actions[one].encode(None) for one in simulator.agents})
     assert min(seen.values()) > 10, seen

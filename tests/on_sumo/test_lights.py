@@ -9,7 +9,6 @@ import pytest
 libsumo = pytest.importorskip("libsumo")
 sumolib = pytest.importorskip("sumolib")
 
-from crashhunt.scenario import load_scenario  # noqa: E402
 
 NET = Path(__file__).parent / "nets" / "grid-lights.net.xml.gz"
 SCENARIO = """schema = 1
@@ -26,9 +25,7 @@ EDGES = ("A0A1", "A0A1.80.00", "A1B1", "A1B1.80.00", "B1C1", "B1C1.80.00", "C1C2
 STEPS = 120
 
 
-def simulator_in(folder):
-    from crashhunt.sumo import SumoSimulator
-
+def simulator_in(sumo_runs):
     net = sumolib.net.readNet(str(NET))
     edges = [one for one in EDGES if net.hasEdge(one)]
     others = "".join(
@@ -36,28 +33,23 @@ def simulator_in(folder):
         f'<route edges="{" ".join(edges[1:])}"/></vehicle>'
         for number in range(8)
     )
-    (folder / "r.rou.xml").write_text(f'<routes><route id="ego" edges="{" ".join(edges)}"/>{others}</routes>')
-    (folder / NET.name).write_bytes(NET.read_bytes())
-    (folder / "scenario.toml").write_text(SCENARIO)
-    return SumoSimulator(load_scenario(str(folder)), folder), net
+    routes = f'<routes><route id="ego" edges="{" ".join(edges)}"/>{others}</routes>'
+    return sumo_runs.open(sumo_runs.write(NET, routes, {"scenario.toml": SCENARIO})), net
 
 
-def drive(folder, look):
+def drive(sumo_runs, look):
     """Drive ahead; return the last scene, after a look at each step."""
-    simulator, net = simulator_in(folder)
-    try:
-        simulator.reset(seed=1)
-        for _ in range(STEPS):
-            if not simulator.agents:
-                break
-            look(simulator, net)
-            simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
-        return simulator.scene().data.tolist()
-    finally:
-        simulator.close()
+    simulator, net = simulator_in(sumo_runs)
+    simulator.reset(seed=1)
+    for _ in range(STEPS):
+        if not simulator.agents:
+            break
+        look(simulator, net)
+        simulator.step({"ego": simulator.actions["ego"].encode((10.0, 0))})
+    return simulator.scene().data.tolist()
 
 
-def test_lights_are_those_of_the_simulator_and_reading_them_changes_nothing(tmp_path):
+def test_lights_are_those_of_the_simulator_and_reading_them_changes_nothing(sumo_runs):
     seen, lit = set(), set()
 
     def look(simulator, net):
@@ -87,10 +79,6 @@ def test_lights_are_those_of_the_simulator_and_reading_them_changes_nothing(tmp_
             assert signal["distance"] == pytest.approx(nearest[0][2], abs=0.1)
             assert "gyr"[int(signal["state"])] == COLOURS[nearest[0][3]]
 
-    folders = [tmp_path / "read", tmp_path / "unread"]
-    for folder in folders:
-        folder.mkdir()
-    read, unread = drive(folders[0], look), drive(folders[1], lambda *_: None)
-    assert read == unread
+    assert drive(sumo_runs, look) == drive(sumo_runs, lambda *_: None)
     assert seen == {"g", "y", "r"}
     assert len(lit) > 2

@@ -186,19 +186,15 @@ def test_all_actors_within_the_radius_are_shown_in_every_step(tmp_path):
             assert shown["actors"][:, 0].sum() == len(near)
 
 
-def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(tmp_path):
+def test_default_observation_keeps_its_fast_path_and_other_agents_keep_theirs(sumo_runs):
     scenario = load_scenario("loop-two-agents")
     first, second = scenario.agents
     agents = {**scenario.agents, first: replace(scenario.agents[first], observation=("ego",))}
-    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    values = argument_values(scenario)
-    with closing(SumoSimulator(scenario, tmp_path / "a")) as plain:
-        before, _ = plain.reset(seed=3, options={"arguments": values})
-    with closing(SumoSimulator(replace(scenario, agents=agents), tmp_path / "b")) as simulator:
-        after, _ = simulator.reset(seed=3, options={"arguments": values})
-        assert after[second].tobytes() == before[second].tobytes()
-        assert set(simulator.restore_observation(first, after[first])) == {"ego"}
-        assert set(simulator.shown_spaces) == {first}
+    _, before = sumo_runs.begin(scenario, 3)
+    simulator, after = sumo_runs.begin(replace(scenario, agents=agents), 3)
+    assert after[second].tobytes() == before[second].tobytes()
+    assert set(simulator.restore_observation(first, after[first])) == {"ego"}
+    assert set(simulator.shown_spaces) == {first}
 
 
 def test_grid_and_image_show_the_lanes_and_the_vehicles_of_the_network(tmp_path):
@@ -322,27 +318,24 @@ def test_obstacle_ends_rays_and_sight_and_is_in_grid_and_image(kind, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["acceleration_steering", "throttle_brake_steering"])
-def test_ego_that_moves_freely_is_where_its_bicycle_model_is(form, tmp_path):
-    scenario = load_scenario("motorway")
-    agents = {"ego": replace(scenario.agents["ego"], observation=("ego", "actors"), action=form)}
-    with closing(SumoSimulator(replace(scenario, agents=agents), tmp_path)) as simulator:
-        simulator.reset(seed=2, options={"arguments": argument_values(scenario)})
-        motion, columns = simulator._driving.moving["ego"], simulator.observation_layouts["ego"].columns["ego"]
-        driven, before = 0.0, motion.state
-        for step in range(25):
-            wave = 0.02 * math.sin(step / 4)
-            action = (0.5, wave) if form == "acceleration_steering" else (0.3, 0.0, wave)
-            observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
-            own = simulator.restore_observation("ego", observations["ego"])["ego"]
-            state = motion.state
-            driven += math.hypot(state.x - before.x, state.y - before.y)
-            expected = {
-                "x": state.x, "y": state.y, "speed": state.speed, "steering": state.steering, "heading": state.heading,
-                "yaw_rate": (state.heading - before.heading) / 0.1, "acceleration": (state.speed - before.speed) / 0.1,
-            }  # fmt: skip
-            assert own[[columns[name] for name in expected]] == pytest.approx([*expected.values()], abs=2e-3), step
-            assert own[columns["distance"]] == pytest.approx(driven, rel=1e-4)
-            before = state
+def test_ego_that_moves_freely_is_where_its_bicycle_model_is(form, sumo_runs):
+    simulator, _ = sumo_runs.begin("motorway", 2, observation=("ego", "actors"), action=form)
+    motion, columns = simulator._driving.moving["ego"], simulator.observation_layouts["ego"].columns["ego"]
+    driven, before = 0.0, motion.state
+    for step in range(25):
+        wave = 0.02 * math.sin(step / 4)
+        action = (0.5, wave) if form == "acceleration_steering" else (0.3, 0.0, wave)
+        observations, *_ = simulator.step({"ego": simulator.actions["ego"].encode(action)})
+        own = simulator.restore_observation("ego", observations["ego"])["ego"]
+        state = motion.state
+        driven += math.hypot(state.x - before.x, state.y - before.y)
+        expected = {
+            "x": state.x, "y": state.y, "speed": state.speed, "steering": state.steering, "heading": state.heading,
+            "yaw_rate": (state.heading - before.heading) / 0.1, "acceleration": (state.speed - before.speed) / 0.1,
+        }  # fmt: skip
+        assert own[[columns[name] for name in expected]] == pytest.approx([*expected.values()], abs=2e-3), step
+        assert own[columns["distance"]] == pytest.approx(driven, rel=1e-4)
+        before = state
 
 
 def test_every_part_stacks_with_a_history_and_is_within_its_space(tmp_path):
@@ -505,46 +498,43 @@ def densely(line):
 
 
 @pytest.mark.parametrize(("target", "second"), [("cd", ":c_c1_0"), ("cs", ":c_c2_0")])
-def test_crossings_show_the_persons_near_them(target, second, tmp_path):
+def test_crossings_show_the_persons_near_them(target, second, sumo_runs):
     """Persons, distances and their order by SUMO's own shapes and positions."""
     walks = "".join(
         f'<person id="p{number}" depart="{at}" departPos="-8"><walk from="{a}" to="{b}"/></person>'
         for number, (at, a, b) in enumerate([(0, "wc", "cw"), (1, "wc", "cs"), (1, "wc", "cw"), (3, "sc", "cd")])
     )
-    (tmp_path / "r.rou.xml").write_text(f'<routes><route id="ego" edges="wc {target}"/>{walks}</routes>')
-    (tmp_path / "walks.net.xml").write_bytes((NETS / "walks.net.xml").read_bytes())
-    (tmp_path / "scenario.toml").write_text(CROSSING_TOWN)
+    routes = f'<routes><route id="ego" edges="wc {target}"/>{walks}</routes>'
+    simulator = sumo_runs.open(sumo_runs.write(NETS / "walks.net.xml", routes, {"scenario.toml": CROSSING_TOWN}))
     net = sumolib.net.readNet(str(NETS / "walks.net.xml"), withInternal=True, withPedestrianConnections=True)
     crossings = (":c_c3_0", second)
     lines = [tuple(point[:2] for point in net.getLane(name).getShape()) for name in crossings]
-    (tmp_path / "stage").mkdir()
-    with closing(SumoSimulator(load_scenario(str(tmp_path)), tmp_path / "stage")) as simulator:
-        people, yields = 0, False
-        for shown in episode(simulator, 1, 260, speed=1.2):
-            lane = libsumo.vehicle.getLaneID("ego")
-            if not lane.startswith("wc"):
-                continue
-            rows = shown["crossings"]
-            assert rows[:, 0].tolist() == [1.0, 1.0, 0.0, 0.0]
-            assert rows[0, 1] < rows[1, 1]
-            middles = []
-            for person in libsumo.person.getIDList():
-                x, y = libsumo.person.getPosition(person)
-                angle = math.radians(90.0 - libsumo.person.getAngle(person))
-                half = libsumo.person.getLength(person) / 2
-                middles.append((x - half * math.cos(angle), y - half * math.sin(angle)))
-            for row, line, crossing in zip(rows, lines, crossings, strict=False):
-                away = [sumolib.geomhelper.distancePointToPolygon(one, line) for one in middles]
-                assert row[3] == sum(one <= 5.0 for one in away)
-                stop_line, begin, middle = area_on(net, lane, target, line)
-                assert row[1] == pytest.approx(stop_line - libsumo.vehicle.getLanePosition("ego") + begin, abs=0.1)
-                nearest = min((math.dist(middle, one) for one in middles), default=1000.0)
-                assert row[4] == pytest.approx(nearest, abs=0.1)
-                people += int(row[3])
-                yields |= bool(row[2])
-                assert row[2] == must_yield(net, lane, target, crossing)
-        assert people > 20
-        assert yields == (target == "cs")  # who turns gives way
+    people, yields = 0, False
+    for shown in episode(simulator, 1, 260, speed=1.2):
+        lane = libsumo.vehicle.getLaneID("ego")
+        if not lane.startswith("wc"):
+            continue
+        rows = shown["crossings"]
+        assert rows[:, 0].tolist() == [1.0, 1.0, 0.0, 0.0]
+        assert rows[0, 1] < rows[1, 1]
+        middles = []
+        for person in libsumo.person.getIDList():
+            x, y = libsumo.person.getPosition(person)
+            angle = math.radians(90.0 - libsumo.person.getAngle(person))
+            half = libsumo.person.getLength(person) / 2
+            middles.append((x - half * math.cos(angle), y - half * math.sin(angle)))
+        for row, line, crossing in zip(rows, lines, crossings, strict=False):
+            away = [sumolib.geomhelper.distancePointToPolygon(one, line) for one in middles]
+            assert row[3] == sum(one <= 5.0 for one in away)
+            stop_line, begin, middle = area_on(net, lane, target, line)
+            assert row[1] == pytest.approx(stop_line - libsumo.vehicle.getLanePosition("ego") + begin, abs=0.1)
+            nearest = min((math.dist(middle, one) for one in middles), default=1000.0)
+            assert row[4] == pytest.approx(nearest, abs=0.1)
+            people += int(row[3])
+            yields |= bool(row[2])
+            assert row[2] == must_yield(net, lane, target, crossing)
+    assert people > 20
+    assert yields == (target == "cs")  # who turns gives way
 
 
 def test_vehicle_data_contain_the_limits_of_the_bicycle_model(tmp_path):

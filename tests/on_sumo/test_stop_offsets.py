@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 
 import libsumo
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from crashhunt.scenario import load_scenario
-from crashhunt.sumo import SumoSimulator
 from crashhunt.sumo._lane_graph import lane_graph
 
 OFFSET_M = 6.0
@@ -33,7 +31,7 @@ observation = ["signals", "stop_line", "right_of_way"]
 
 
 @pytest.fixture
-def scenario_of(tmp_path):
+def scenario_of(sumo_runs, tmp_path):
     def make(edges, lane, attributes):
         tag = f'<lane id="{lane}" '
         before, after = NET.split(tag)
@@ -41,10 +39,7 @@ def scenario_of(tmp_path):
         (tmp_path / "n.net.xml").write_text(
             f'{before}{tag}{own}><stopOffset value="{OFFSET_M}" {attributes}/></lane>{rest}'
         )
-        (tmp_path / "r.rou.xml").write_text(ROUTES)
-        (tmp_path / "scenario.toml").write_text(SCENARIO % edges)
-        (tmp_path / "stage").mkdir()
-        return load_scenario(str(tmp_path))
+        return load_scenario(sumo_runs.write(tmp_path / "n.net.xml", ROUTES, {"scenario.toml": SCENARIO % edges}))
 
     return make
 
@@ -52,17 +47,16 @@ def scenario_of(tmp_path):
 @pytest.mark.parametrize("edges", [["south", "east"], ["north", "middle", "east"]])
 @pytest.mark.parametrize("attributes", ['vClasses="all"', 'exceptions="bicycle bus"'])
 def test_distances_are_those_to_the_stop_line_where_sumos_driver_waits_at_a_light(
-    edges, attributes, scenario_of, tmp_path
+    edges, attributes, scenario_of, sumo_runs
 ):
     lane = f"{edges[0]}_0"
-    scenario = scenario_of(edges, lane, attributes)
-    with closing(SumoSimulator(scenario, tmp_path / "stage")) as simulator:
-        observations, _ = simulator.reset(seed=1)
-        for _ in range(180):
-            observations, *_ = simulator.step({"ego": np.array((-1.0, 0.0))})
-        shown = simulator.restore_observation("ego", observations["ego"])
-        assert libsumo.vehicle.getSpeed("ego") == 0.0
-        to_end = libsumo.lane.getLength(lane) - libsumo.vehicle.getLanePosition("ego")
+    simulator = sumo_runs.open(scenario_of(edges, lane, attributes))
+    simulator.reset(seed=1)
+    for _ in range(180):
+        observations, *_ = simulator.step({"ego": np.array((-1.0, 0.0))})
+    shown = simulator.restore_observation("ego", observations["ego"])
+    assert libsumo.vehicle.getSpeed("ego") == 0.0
+    to_end = libsumo.lane.getLength(lane) - libsumo.vehicle.getLanePosition("ego")
     assert shown["stop_line"][1] == pytest.approx(to_end - OFFSET_M)
     if edges[0] == "south":  # before a road with priority, SUMO's driver creeps over the line
         assert OFFSET_M <= to_end < OFFSET_M + 1.2
