@@ -280,28 +280,7 @@ def hunted(toy, harm, *words):
     return result
 
 
-@pytest.mark.parametrize(
-    ("harm", "words", "outcome", "message"),
-    [
-        ("SIGSEGV", (), "process_died", "the process died of SIGSEGV in ego's act() of step 4"),
-        pytest.param(
-            "abort", (), "process_died", "the process died of SIGABRT in ego's act() of step 4",
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param(
-            "exit", (), "process_died", "the process exited with 0 in ego's act() of step 4",
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param(
-            "deadlock", ("--timeout", "1"), "hang", "still running after 1 s in ego's act() of step 4",
-            marks=pytest.mark.nightly,
-        ),
-        pytest.param("shape", (), "agent_error", "ego: crashhunt_act has written more", marks=pytest.mark.nightly),
-    ],
-)  # fmt: skip
-def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcome, message):
-    compile_library(toy.folder)
-    result = hunted(toy, harm, *words)
+def check_failure(result, harm, outcome, message):
     assert (result["outcome"], result["failure"]["agent"]) == (outcome, "ego")
     assert result["failure"]["message"].startswith(message)
     if harm in ("SIGSEGV", "deadlock") and find_spec("_crashhunt_native_stack") and shutil.which("addr2line"):
@@ -310,10 +289,26 @@ def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcom
         )
 
 
-def test_a_replay_runs_the_saved_library_and_reports_that_the_current_one_differs(toy):
+@pytest.mark.nightly  # by day, the library of the next test dies
+@pytest.mark.parametrize(
+    ("harm", "words", "outcome", "message"),
+    [
+        ("abort", (), "process_died", "the process died of SIGABRT in ego's act() of step 4"),
+        ("exit", (), "process_died", "the process exited with 0 in ego's act() of step 4"),
+        ("deadlock", ("--timeout", "1"), "hang", "still running after 1 s in ego's act() of step 4"),
+        ("shape", (), "agent_error", "ego: crashhunt_act has written more"),
+    ],
+)
+def test_harm_has_the_right_outcome_and_names_the_agent(toy, harm, words, outcome, message):
     compile_library(toy.folder)
-    hunted(toy, "fails")
-    compile_library(toy.folder, source=IN_C.replace('kind, "fails"', 'kind, "never"'))
+    check_failure(hunted(toy, harm, *words), harm, outcome, message)
+
+
+def test_a_library_that_dies_is_a_crash_and_a_replay_runs_the_saved_one_and_reports_that_the_current_one_differs(toy):
+    compile_library(toy.folder)
+    message = "the process died of SIGSEGV in ego's act() of step 4"
+    check_failure(hunted(toy, "SIGSEGV"), "SIGSEGV", "process_died", message)
+    compile_library(toy.folder, source=IN_C.replace('kind, "SIGSEGV"', 'kind, "never"'))
     facts = toy.crashhunt("show", "h", "--json").json["programs"]["./libplanner.so"]
     assert facts["machine"] == platform.machine()
     assert any(name.startswith("libm.so") for name in facts["system"])

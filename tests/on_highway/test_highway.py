@@ -7,12 +7,14 @@ import math
 import random
 import subprocess
 import sys
+from importlib import import_module
 
 import gymnasium
 import numpy as np
 import pytest
 from conftest import mostly_nightly, one_in
 
+from crashhunt.episode import _failures
 from crashhunt.errors import InvalidEpisodeError, ScenarioError, UnusableValueError
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._descriptor import HighwaySetup
@@ -453,10 +455,5 @@ def test_environment_of_a_users_is_constructed_in_each_episode(how, tmp_path, mo
 
 def test_packages_that_simulators_use_are_known_wherever_their_homes_are():
     """Replaced functions of these packages are noticed, so that a failure in them is the agent's."""
-    code = (
-        "import crashhunt.gym._simulator, crashhunt.highway._simulator, crashhunt.sumo._simulator\n"
-        "from crashhunt.episode import _failures\n"
-        "print(*_failures._packages_of_simulators())"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert {"crashhunt", "numpy", "gymnasium", "highway_env", "libsumo"} <= set(done.stdout.split())
+    assert all(import_module(f"crashhunt.{name}._simulator") for name in ("gym", "highway", "sumo"))
+    assert {"crashhunt", "numpy", "gymnasium", "highway_env", "libsumo"} <= _failures._packages_of_simulators()
