@@ -142,6 +142,21 @@ def test_our_own_ci_uses_them_as_they_are():
     assert used == set(NAMES)
 
 
+def test_steps_of_the_ci_page_give_inputs_that_the_actions_have():
+    text = (ROOT / "crashhunt" / "guide" / "tutorials" / "ci.md").read_text()
+    steps = []
+    for shown in map(yaml.safe_load, re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)):
+        steps += shown if isinstance(shown, list) else [step for job in shown["jobs"].values() for step in job["steps"]]
+    used = set()
+    for step in (step for step in steps if "crashhunt/" in step.get("uses", "")):
+        place, version = step["uses"].split("@")
+        used.add(name := Path(place).name)
+        assert place == f"crashhunt/crashhunt/.github/actions/{name}"
+        assert re.fullmatch(r"v\d+\.\d+\.\d+", version)
+        assert step.get("with", {}).keys() <= action(name)["inputs"].keys()
+    assert used == set(NAMES)
+
+
 STUB = """#!/usr/bin/env python3
 import json, os, pathlib, sys
 words = sys.argv[1:]

@@ -63,3 +63,14 @@ def test_a_bundle_alone_is_shown(shell, place):
         archive.extractall(shell.folder)
     (crash,) = (shell.folder / "crashes").iterdir()
     assert "drove into vehicle." in shell.crashhunt("show", str(crash)).out
+
+
+@pytest.mark.nightly
+def test_crash_of_format_version_1_has_its_omission(shell):
+    archive = BUNDLES[0]
+    words = ("judge", str(archive), "--runs", "1", "--why", "0", "--trust", "--json")
+    (judged,) = shell.crashhunt(*words).json["judged"]
+    omission = judged["reference"]["omission"]
+    assert (omission["faculty"], omission["kind"], omission["actor"]) == ("lateral", "alongside left", "left.8")
+    assert [run["ending"] for run in judged["reference"]["runs"]] == ["none"] * 3
+    assert judged["attempts"][0]["changed"] == ["ego does not change lanes"]  # braking drops the lane change, too

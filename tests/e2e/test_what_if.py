@@ -28,12 +28,6 @@ def hunted_on_sumo(shell):
     shell.crashhunt("run", "h", "2", "60", "400", *words)
 
 
-def hunted_on_highway(shell):
-    """One crash in each of two scenarios of highway-env, for `made_once`."""
-    shell.crashhunt("run", "h", "2", "60", "60", "--scenario", "highway", "--seed", "1")
-    shell.crashhunt("run", "i", "2", "60", "60", "--scenario", "intersection-highway-env", "--seed", "1")
-
-
 @pytest.fixture
 def crash(toy, made_once):
     return made_once(hunted, toy)
@@ -119,22 +113,6 @@ def test_futures_on_sumo_are_real_and_agents_take_over(shell, made_once, make):
     assert "--leave-out 'unicorn': there is no such actor" in err
 
 
-@pytest.mark.nightly
-def test_futures_on_highway_env_exist_where_it_draws_random_numbers(shell, made_once):
-    made_once(hunted_on_highway, shell)
-    err = shell.crashhunt("whatif", "h", "--from-step", "2", "--futures", expect=2).err
-    assert "20 futures with different seeds are bit-identical" in err
-    assert err.count("\n") == 1
-    found = shell.crashhunt("whatif", "i", "--from-step", "2", "--futures", "--times", "8", "--json").json
-    assert (found["runs"], found["different"] > 4) == (8, True)
-    assert len(found["outcomes"]) == 2
-    for hunt in ("h", "i"):
-        was = find_bundle(shell.folder / hunt).result
-        same = shell.crashhunt("whatif", hunt, "--before", "1", "--overrule", "keep_speed", "--json").json
-        assert (same["runs"], same["excluded"]) == (1, {})
-        assert same["from_step"] < was.steps
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     one_in(
@@ -154,20 +132,3 @@ def test_bad_input_is_refused_in_one_line(crash, words, said):
     done = crash.crashhunt("whatif", "h", *words, expect=2)
     assert said in done.err
     assert (done.err.count("\n"), done.out) == (1, "")
-
-
-@pytest.mark.nightly
-def test_one_of_two_agents_is_replaced(shell):
-    words = ("--scenario", "loop-two-agents", "--seed", "1")
-    shell.crashhunt("run", "h", "2", "60", "400", *words)
-    bundle = find_bundle(shell.folder / "h")
-    agents = list(bundle.result.spec.arguments)
-    assert len(agents) == 2
-    err = shell.crashhunt("whatif", "h", "--before", "3", *SPEED[:2], expect=2).err
-    assert f"the crash has several agents; name one of {', '.join(agents)}" in err
-    driver = f"{bundle.driver}=crashhunt.agents:KeepLaneWithSpeed"
-    found = shell.crashhunt("whatif", "h", "--before", "3", "--agent", driver, "--arg", "speed=2", "--json").json
-    assert (found["runs"], found["excluded"]) == (1, {})
-    assert found["each"][0]["digest"] != bundle.result.digest
-    same = shell.crashhunt("whatif", "h", "--json").json
-    assert same["each"][0]["digest"] == bundle.result.digest
