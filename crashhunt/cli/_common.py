@@ -48,14 +48,14 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
 
-class CommandOptions(argparse.Namespace):
+class Parsed(argparse.Namespace):
     """The values of a command's arguments, and the ways to print its answer."""
 
     json: bool  # whether to print one JSON object to stdout, and all other text to stderr
 
-    def say(self, text: str, *, beside: bool = False) -> None:
-        """Print a text for the user; a text ``beside`` the answer always goes to stderr."""
-        print(visible(text), file=sys.stderr if self.json or beside else sys.stdout)
+    def say(self, text: str, *, to_stderr: bool = False) -> None:
+        """Print a text for the user, to stderr if the answer has another form or ``to_stderr`` is given."""
+        print(visible(text), file=sys.stderr if self.json or to_stderr else sys.stdout)
 
     def print_json(self, data: object) -> None:
         """Print data as one JSON object if the user requested JSON."""
@@ -92,7 +92,7 @@ class Parser(argparse.ArgumentParser):
                 fix = f"see {self.prog} --help; if it is a file or folder, write ./{word}"
                 raise UsageError(f"there is no option {word!r}", fix=fix)
             before = word
-        found, rest = super().parse_known_args(args, CommandOptions() if namespace is None else namespace)
+        found, rest = super().parse_known_args(args, Parsed() if namespace is None else namespace)
         ends_in_list = next(
             (one for one in reversed(self._actions) if not one.option_strings and one.nargs == "*"), None
         )
@@ -450,7 +450,7 @@ def add_ci_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def tell(options: CommandOptions, summary: str, annotations: Sequence[str]) -> None:
+def tell(options: Parsed, summary: str, annotations: Sequence[str]) -> None:
     """Write the summary and print the annotations, if the user requested them.
 
     Raises:

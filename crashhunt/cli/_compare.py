@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import CommandOptions, Commands, add_json
+from crashhunt.cli._common import Commands, Parsed, add_json
 from crashhunt.plans import RATE_PERS
 
 
@@ -33,7 +33,7 @@ def add_compare(commands: Commands) -> None:
     compare.set_defaults(command=_compare)
 
 
-def _compare(options: CommandOptions, _words: list[str]) -> int:
+def _compare(options: Parsed, _words: list[str]) -> int:
     from crashhunt.report import comparison_page, describe_comparison
     from crashhunt.results import find_searches
     from crashhunt.statistics import compare
@@ -44,7 +44,7 @@ def _compare(options: CommandOptions, _words: list[str]) -> int:
             if hunt == directory or (hunt / layout.HUNT).exists():
                 hunts.append(hunt)
             else:
-                options.say(f"{command_line(hunt)} has not begun, and is excluded", beside=True)
+                options.say(f"{command_line(hunt)} has not begun, and is excluded", to_stderr=True)
     found = compare(*hunts, per=options.per)
     if options.csv:
         found.write_csv(sys.stdout)
@@ -52,6 +52,6 @@ def _compare(options: CommandOptions, _words: list[str]) -> int:
         options.say(describe_comparison(found))
     if options.html is not None:
         comparison_page(found, options.html)
-        options.say(f"{command_line(options.html)} has the plots", beside=options.csv)
+        options.say(f"{command_line(options.html)} has the plots", to_stderr=options.csv)
     options.print_json(found.to_json())
     return 0

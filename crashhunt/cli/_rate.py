@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import (
-    DONE,
-    NO_ANSWER,
-    THE_ANSWER_IS_NO,
-    CommandOptions,
-    Commands,
-    GivenOnce,
-    add_json,
-    number,
-)
+from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, Commands, GivenOnce, Parsed, add_json, number
 from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:
@@ -65,7 +56,7 @@ def add_rate(commands: Commands) -> None:
     rate.set_defaults(command=_rate)
 
 
-def _rate(options: CommandOptions, _words: list[str]) -> int:
+def _rate(options: Parsed, _words: list[str]) -> int:
     from crashhunt.plans import check_rate, rate_of
     from crashhunt.report import describe_rates, rates_page, write_rates_csv
     from crashhunt.results import find_searches
@@ -93,7 +84,7 @@ def _rate(options: CommandOptions, _words: list[str]) -> int:
         options.say(describe_rates(rates))
     if options.html is not None:
         rates_page(rates, options.html)
-        options.say(f"{command_line(options.html)} has the page", beside=options.csv)
+        options.say(f"{command_line(options.html)} has the page", to_stderr=options.csv)
     options.print_json({"rates": [rate.to_json() for rate in rates]})
     return DONE if bar is None else exit_code_of(rate.verdict for rate in rates)
 
