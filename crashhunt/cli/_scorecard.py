@@ -13,7 +13,6 @@ from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     DONE,
     NO_ANSWER,
-    CommandOptions,
     Commands,
     Parsed,
     WordsWithCommas,
