@@ -20,12 +20,10 @@ from types import SimpleNamespace
 
 import pytest
 from conftest import keeps_going, mostly_nightly, wait_for
-from repositories import git
 
 from crashhunt.base.git import run_to_end
 from crashhunt.base.process_owners import OwnerProcess, owner_in, start_time, this_process
 from crashhunt.base.temporary import remove_leftovers, remove_tree
-from crashhunt.corpus import _bisection as _bisect
 from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.hunts import Hunt, check, salvage
@@ -276,45 +274,6 @@ def described(path: Path) -> dict[str, int]:
     if path.is_dir():
         return {str(file.relative_to(path)): file.stat().st_size for file in path.rglob("*") if file.is_file()}
     return {path.name: path.stat().st_size // 1000}
-
-
-@pytest.mark.nightly
-def test_bisect_that_was_killed_leaves_no_work_tree(tmp_path, monkeypatch):
-    git(tmp_path, "init", "-q", "-b", "main")
-    for number in range(3):
-        (tmp_path / "code").write_text("good" if number < 1 else f"bad {number}")
-        git(tmp_path, "add", "code")
-        git(tmp_path, "commit", "-qm", str(number))
-
-    def ran(case, folder, tree, modules):
-        return ("still" if (tree / "code").read_text().startswith("bad") else "fixed"), ""
-
-    monkeypatch.setattr(_bisect, "_run", ran)
-    monkeypatch.setattr(_bisect, "add_case", lambda bundle, to: SimpleNamespace(case=SimpleNamespace(path=to)))
-    monkeypatch.setattr(_bisect, "read_settings", lambda path: SimpleNamespace(agents={}, texts={}))
-
-    def bisected():
-        return _bisect.bisect(SimpleNamespace(hunt=tmp_path), "main~2", bad="main", folder=tmp_path)
-
-    files = {*tmp_path.rglob("*")} | {tmp_path / ".git" / "packed-refs"}  # which Git itself writes
-    count = killed(bisected, NEVER)
-    assert {*tmp_path.rglob("*")} <= files
-    before = {*tmp_path.rglob("*")}
-    trees = 0
-    for step in range(1, count + 1):
-        assert killed(bisected, step) == 0
-        trees += len([*(tmp_path / ".git").glob("worktrees/*")])
-        remove_leftovers()
-        assert {*tmp_path.rglob("*")} == before, step
-        assert left_in(tmp_path) == []
-    assert trees
-    # One of the user stays, and so does one of a bisect that runs.
-    git(tmp_path, "worktree", "add", "-q", "--detach", str(tmp_path.with_name("mine")))
-    assert killed(bisected, count - 3) == 0
-    remove_leftovers()
-    assert [path.name for path in (tmp_path / ".git" / "worktrees").iterdir()] == ["mine"]
-    assert bisected().subject == "1"
-    shutil.rmtree(tmp_path.with_name("mine"))
 
 
 def test_what_bisect_runs_ends_with_it(tmp_path):
