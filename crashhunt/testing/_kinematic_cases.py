@@ -6,7 +6,8 @@ new speed; contact is examined before the step. Both vehicles are 4.3 m long and
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, Self
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,11 +15,12 @@ from crashhunt.agents import GRAVITY_MPS2, REFERENCE_MODELS, Situation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from types import TracebackType
+    from contextlib import AbstractContextManager
 
     from numpy.typing import NDArray
 
     Values = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
     Columns = Mapping[str, Values]
 
 STEP_S = 0.1
@@ -43,14 +45,6 @@ class Vehicles(Protocol):
 
     speeds: Values
 
-    def __enter__(self) -> Self:
-        """Return the vehicles."""
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Remove the vehicles."""
-
     def drive(self, accelerations: Values) -> Values:
         """Simulate one step with accelerations in m/s²; return the way that each vehicle has driven in it, in m."""
 
@@ -60,15 +54,6 @@ class KinematicVehicles:
 
     def __init__(self, speeds: Values) -> None:
         self.speeds = speeds
-
-    def __enter__(self) -> Self:
-        """Return the vehicles."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Do nothing."""
 
     def drive(self, accelerations: Values) -> Values:
         """Move all vehicles for one step; return their ways in m."""
@@ -105,22 +90,12 @@ def solve_cut_in(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, Va
         moved = moved + np.where(step < run_up, lateral, 0.0) * STEP_S
     y = _OWN_LANE_M - WIDTH_M / 2 - _SIDE_GAP_M - WIDTH_M / 2 - moved
     lateral, answer = np.zeros(count), np.zeros(count)
-    length, seen = np.full(count, LENGTH_M), np.ones(count, bool)
+    seen = np.ones(count, bool)
     for _ in range(_STEPS + int(run_up.max(initial=0))):
         side = np.abs(y - _OWN_LANE_M) - WIDTH_M
         touches = (side < 0) & (gap <= 0) & (gap > -2 * LENGTH_M) & (answer == 0)
         answer[touches] = np.where(gap[touches] > -LENGTH_M, 2, 1)
-        situation = Situation(
-            speed=speed,
-            other_speed=other_speed,
-            gap=gap,
-            lateral_gap=side,
-            lateral_speed=lateral,
-            length=length,
-            other_length=length,
-            visible=seen,
-        )
-        acceleration = driver.brake(situation)
+        acceleration = driver.brake(_situation(speed, other_speed, gap, side, lateral, seen))
         lateral = np.where(y < _OWN_LANE_M, np.minimum(full, lateral + LATERAL_ACCELERATION_MPS2 * STEP_S), 0.0)
         moved, speed = vehicles.drive(acceleration), vehicles.speeds
         gap = gap - (moved - other_speed * STEP_S)
@@ -153,7 +128,7 @@ def solve_cut_out(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, V
     following = driver.following_distance(speed)
     gap, front, front_speed = following, cases["front_m"], speed
     distance = gap + LENGTH_M + front  # to the obstacle: the standing vehicle, or the vehicle ahead that has hit it
-    y, zero, length = np.zeros(count), np.zeros(count), np.full(count, LENGTH_M)
+    y, zero = np.zeros(count), np.zeros(count)
     answer, front_answer, ended = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
     for _ in range(_STEPS):
         hits = (front <= _FRONT_CONTACT_M) & (front > -2 * LENGTH_M) & (y < WIDTH_M - _TIE) & ~ended & ~front_answer
@@ -164,16 +139,8 @@ def solve_cut_out(cases: Columns, model: str, vehicles: Vehicles) -> dict[str, V
         ended |= (speed <= 0) | (answer > 0)
         if np.all(ended):
             break
-        situation = Situation(
-            speed=speed,
-            other_speed=zero,
-            gap=distance,
-            lateral_gap=zero - WIDTH_M,
-            lateral_speed=zero,
-            length=length,
-            other_length=length,
-            visible=(y >= WANDERING_M - _TIE) | front_answer,
-        )
+        visible = (y >= WANDERING_M - _TIE) | front_answer
+        situation = _situation(speed, zero, distance, zero - WIDTH_M, zero, visible)
         moved, speed = vehicles.drive(driver.brake(situation)), vehicles.speeds
         distance = distance - moved
         gap = gap - (moved - front_speed * STEP_S)
@@ -195,25 +162,26 @@ def solve_car_following(cases: Columns, model: str, vehicles: Vehicles) -> dict[
     driver = REFERENCE_MODELS[model](count, STEP_S)
     following = gap = driver.following_distance(speed)
     answer, difference, zero = np.zeros(count), np.zeros(count), np.zeros(count)
-    length, seen = np.full(count, LENGTH_M), np.ones(count, bool)
+    seen = np.ones(count, bool)
     for _ in range(_STEPS):
         hits = (gap <= 0) & (answer == 0)
         answer[hits], difference[hits] = 1, (speed - leader)[hits]
-        situation = Situation(
-            speed=speed,
-            other_speed=leader,
-            gap=gap,
-            lateral_gap=zero - WIDTH_M,
-            lateral_speed=zero,
-            length=length,
-            other_length=length,
-            visible=seen,
-        )
-        acceleration = driver.brake(situation)
+        acceleration = driver.brake(_situation(speed, leader, gap, zero - WIDTH_M, zero, seen))
         leader = np.maximum(leader - cases["decel_g"] * GRAVITY_MPS2 * STEP_S, 0.0)
         moved, speed = vehicles.drive(acceleration), vehicles.speeds
         gap = gap - (moved - leader * STEP_S)
     return {model: answer, f"gap_{model}": following, f"dv_{model}": difference}
+
+
+def _situation(
+    speed: Values, other_speed: Values, gap: Values, lateral_gap: Values, lateral_speed: Values, visible: Flags
+) -> Situation:
+    """Return what the drivers see of the other vehicles, which have the same length as their own."""
+    length = np.full(len(speed), LENGTH_M)
+    return Situation(
+        speed=speed, other_speed=other_speed, gap=gap, lateral_gap=lateral_gap, lateral_speed=lateral_speed,
+        length=length, other_length=length, visible=visible,
+    )  # fmt: skip
 
 
 _SOLVERS: Mapping[str, Callable[[Columns, str, Vehicles], dict[str, Values]]] = {
@@ -224,8 +192,9 @@ _SOLVERS: Mapping[str, Callable[[Columns, str, Vehicles], dict[str, Values]]] = 
 
 
 def solve(
-    kind: str, cases: Columns, model: str, make: Callable[[Values], Vehicles] = KinematicVehicles
+    kind: str, cases: Columns, model: str, make: Callable[[Values], AbstractContextManager[Vehicles]] | None = None
 ) -> dict[str, Values]:
     """Return the answers of a model to cases of a kind, by the names of their columns."""
-    with make(cases["ego_kmh"] / _KMH) as vehicles:
+    speeds = cases["ego_kmh"] / _KMH
+    with nullcontext(KinematicVehicles(speeds)) if make is None else make(speeds) as vehicles:
         return _SOLVERS[kind](cases, model, vehicles)
