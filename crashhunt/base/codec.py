@@ -22,7 +22,6 @@ from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from math import isfinite
 from operator import methodcaller
 from pathlib import Path
 from types import UnionType
@@ -41,6 +40,7 @@ from typing import (
 )
 
 from crashhunt.base.integrity import typed
+from crashhunt.base.json_types import finite
 from crashhunt.base.text import did_you_mean
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def _write_function(kind: Any) -> _Convert:
     lines = ["def write(value):", " data = {}"]
     for key, path, is_optional in written_keys(kind):
         metadata = known[key].metadata if key == path and key in known else {}
-        convert = _finite if "null" in metadata else _writer(hints[key]) if key == path and key in hints else plain
+        convert = finite if "null" in metadata else _writer(hints[key]) if key == path and key in hints else plain
         condition = ""
         names |= {
             f"to_{key}": convert,
@@ -248,7 +248,7 @@ def plain(value: object) -> object:
     if isinstance(value, Enum | Path):
         return str(value)
     if isinstance(value, float):
-        return _finite(value)
+        return finite(value)
     if isinstance(value, tuple) and (names := names_of_tuple(type(value))):
         return plain(dict(zip(names, value, strict=True)))
     if isinstance(value, Mapping):
@@ -256,10 +256,6 @@ def plain(value: object) -> object:
     if isinstance(value, AbstractSet):
         return [plain(held) for held in sorted(value)]
     return [plain(held) for held in value] if isinstance(value, list | tuple) else value
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _writer(hint: object) -> _Convert | None:

@@ -37,8 +37,3 @@ class ErrorData(TypedDict):
 def finite(value: float) -> float | None:
     """Return a number for JSON: null replaces infinity and NaN, which JSON lacks."""
     return value if math.isfinite(value) else None
-
-
-def finite_values(data: Plain) -> dict[str, object]:
-    """Return JSON data in which null replaces every number that is not finite."""
-    return {name: finite(value) if isinstance(value, float) else value for name, value in data.items()}

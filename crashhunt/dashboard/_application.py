@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import tempfile
 import threading
 import time
@@ -20,6 +19,7 @@ from starlette.background import BackgroundTask
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from crashhunt.base.codec import plain
 from crashhunt.base.errors import BundleError, CrashhuntError, UsageError
 from crashhunt.base.version import __version__
 from crashhunt.crashes import export_crash
@@ -307,24 +307,13 @@ class _Shown:
 
 def _answer(request: Request, data: JsonObject) -> Response:
     """Return data as a JSON response, or status 304 if the browser already has these data."""
-    text = json.dumps(_finite({"version": API_VERSION, **data}), ensure_ascii=False, separators=(",", ":"))
+    text = json.dumps(plain({"version": API_VERSION, **data}), ensure_ascii=False, separators=(",", ":"))
     body = text.encode("utf-8", "replace")
     tag = f'"{hashlib.blake2b(body, digest_size=12).hexdigest()}"'
     headers = {"etag": tag, "cache-control": "no-cache", "x-crashhunt-now": f"{time.time():.3f}"}
     if request.headers.get("if-none-match") == tag:
         return Response(status_code=304, headers=headers)
     return Response(body, media_type="application/json", headers=headers)
-
-
-def _finite(value: object) -> object:
-    """Return plain data without the numbers that JSON cannot express: NaN and infinity."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(key): _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return value
 
 
 def _digest(row: JsonObject) -> bytes:

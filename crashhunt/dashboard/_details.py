@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
+from crashhunt.base.pacing import Paced
 from crashhunt.crashes import crash_folders
 from crashhunt.dashboard._catalog import unreadable
 from crashhunt.dashboard._hunt_page import HuntView, read_tail
@@ -154,7 +155,6 @@ def importance_of_points(points: Sequence[Point], first: int = 0) -> list[JsonOb
 
 # Several hunts next to each other, with the numbers of ``crashhunt compare``.
 
-_MAX_SHARE_OF_TIME = 0.05  # that comparisons may take: each reads all trials
 _MAX_TRIALS = 200_000  # of all hunts together
 
 
@@ -163,9 +163,8 @@ class HuntComparer:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._found: tuple[object, JsonObject] | None = None
+        self._found: Paced[JsonObject] = Paced()
         self._paths: tuple[str, ...] = ()
-        self._due = 0.0
 
     def compare(self, views: Sequence[HuntView]) -> JsonObject:
         """Return ``hunts``, each a row with its curve and ``figures``, and ``pairs``, each hunt against the first."""
@@ -184,26 +183,28 @@ class HuntComparer:
 
     def _figures(self, views: Sequence[HuntView], rows: Sequence[JsonObject]) -> JsonObject:
         if not views:
-            return {"hunts": {}, "pairs": [], "problem": ""}
-        paths, key = tuple(str(view.path) for view in views), [(row["dir"], row["trials_run"]) for row in rows]
-        began = time.monotonic()
-        known = self._found
-        if known is not None and paths == self._paths and (known[0] == key or began < self._due):
-            return known[1]
+            return _no_figures("")
         trials = sum(row["trials_run"] for row in rows)
         if trials > _MAX_TRIALS:
             why = f"a comparison reads all trials, of which there are more than {_MAX_TRIALS:,}"
-            return {"hunts": {}, "pairs": [], "problem": f"{why}; run: crashhunt compare"}
+            return _no_figures(f"{why}; run: crashhunt compare")
         if why := next(filter(None, (view.unreadable() for view in views)), ""):
-            return {"hunts": {}, "pairs": [], "problem": why}
-        try:
-            with leave_untouched():
-                found = _figures_as_json(compare(*(view.path for view in views)), rows)
-        except CrashhuntError as error:
-            found = {"hunts": {}, "pairs": [], "problem": str(error)}
-        ended = time.monotonic()
-        self._found, self._paths, self._due = (key, found), paths, ended + (ended - began) / _MAX_SHARE_OF_TIME
-        return found
+            return _no_figures(why)
+
+        def make() -> JsonObject:
+            try:
+                with leave_untouched():
+                    return _figures_as_json(compare(*(view.path for view in views)), rows)
+            except CrashhuntError as error:
+                return _no_figures(str(error))
+
+        paths, before = tuple(str(view.path) for view in views), self._paths
+        self._paths = paths
+        return self._found([(row["dir"], row["trials_run"]) for row in rows], make, now=paths != before)
+
+
+def _no_figures(why: str) -> JsonObject:
+    return {"hunts": {}, "pairs": [], "problem": why}
 
 
 def _figures_as_json(found: Comparison, rows: Sequence[JsonObject]) -> JsonObject:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HuntDirectoryError
+from crashhunt.base.pacing import Paced
 from crashhunt.base.text import command_line
 from crashhunt.crashes import read_notes
 from crashhunt.dashboard._catalog import FoundHunt, unreadable, unreadable_below
@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from crashhunt.training import HeldOutTraffics
 
 _SPARKLINE_POINTS = 48  # points of the curve in the list
-_MAX_SHARE_OF_TIME = 0.05  # that figures may take which read all trials
-_MAX_TRIALS_READ = 200_000  # for such a figure
+_MAX_TRIALS_READ = 200_000  # for a figure that needs all trials
 _LOG_TAIL_BYTES = 20_000  # bytes of a log
 _MAX_ERROR_CHARACTERS = 2_000  # characters of an error, at most
 
@@ -59,8 +58,7 @@ class HuntView:
         self._key: _Key = ()
         self._file: tuple[int, int] = (0, 0)
         self._settings_key: tuple[int, int] = (0, 0)
-        self._snapshots_key: tuple[int, int, int] | None = None
-        self._why_unreadable = ""
+        self._why_unreadable: Paced[str] = Paced()
         self.settings: HuntSettings | None = None
         self.facts: Facts = {}
         self.events: list[tuple[float, str, str]] = []
@@ -68,16 +66,12 @@ class HuntView:
         self.sample: Sample | None = None
         self._last: float | None = None
         self._state: HuntState | None = None
-        self._copies: JsonObject = {}
-        self._notes: list[Note] = []
-        self._notes_key = (0, 0, 0)
+        self._copies: Paced[JsonObject] = Paced()
+        self._sums_of_copies: JsonObject = {}
+        self._notes: Paced[list[Note]] = Paced()
         self._versions: list[JsonObject] = []
-        self._copies_due = 0.0
-        self._rate: JsonObject | None = None
-        self._rate_key: object = None
-        self._rate_due = 0.0
-        self._held_out_rule: HeldOutTraffics | None = None
-        self._held_out_key: object = None
+        self._rate: Paced[JsonObject] = Paced()
+        self._held_out: Paced[HeldOutTraffics] = Paced()
 
     @property
     def path(self) -> Path:
@@ -130,15 +124,9 @@ class HuntView:
         return replace(
             with_crash_counts(state, self.facts, self.counts.crashes),
             code_versions=self._versions or None,
-            notes=self._read_notes() or None,
-            **self._copies,
+            notes=self._notes(_sign(self.path / layout.NOTES), lambda: list(read_notes(self.path)), now=True) or None,
+            **self._sums_of_copies,
         )
-
-    def _read_notes(self) -> list[Note]:
-        """Return the notes of users; the file is read again when it changes."""
-        if (key := _sign(self.path / layout.NOTES)) != self._notes_key:
-            self._notes, self._notes_key = list(read_notes(self.path)), key
-        return self._notes
 
     def unreadable(self) -> str:
         """Return the reason why a file of the hunt must not be opened; empty if all may be.
@@ -148,9 +136,7 @@ class HuntView:
         snapshots = self.path / layout.SNAPSHOTS
         if why := unreadable(self.path, self.found.root):
             return why
-        if (key := _sign(snapshots)) != self._snapshots_key:
-            self._why_unreadable, self._snapshots_key = unreadable_below(snapshots, self.found.root), key
-        return self._why_unreadable
+        return self._why_unreadable(_sign(snapshots), lambda: unreadable_below(snapshots, self.found.root), now=True)
 
     def _read_settings(self) -> None:
         path = self.path / layout.HUNT
@@ -194,15 +180,14 @@ class HuntView:
         The method reads all trials, so it runs only within its share of the time.
         """
         if not self.facts.get("copies"):
-            self._copies = {}
+            self._sums_of_copies = {}
             return
-        began = time.monotonic()
-        is_last = self.facts.get("state") != "running"
-        if began < self._copies_due and not is_last:
-            return
-        self._copies = {"probes": sums_of_probes(ledger, self.facts), "branches": sums_of_branches(ledger, self.facts)}
-        ended = time.monotonic()
-        self._copies_due = ended + (ended - began) / _MAX_SHARE_OF_TIME
+        has_ended = self.facts.get("state") != "running"
+        self._sums_of_copies = self._copies(
+            (self._file, self._last, has_ended),
+            lambda: {"probes": sums_of_probes(ledger, self.facts), "branches": sums_of_branches(ledger, self.facts)},
+            now=has_ended,
+        )
 
     # What the pages show.
 
@@ -258,23 +243,19 @@ class HuntView:
         if settings is None or counts is None or not counts.trials:
             return None
         try:
-            held_out = self._held_out(settings)
+            held_out = self._held_out(
+                _sign(self.path / layout.SNAPSHOTS), lambda: held_out_traffics(settings, [self.path]), now=True
+            )
         except CrashhuntError as error:
             return {"why_not": str(error)[:_MAX_ERROR_CHARACTERS]}
         if counts_suffice(settings, self.facts, held_out):
-            key = counts.prefix
-            if key != self._rate_key:
-                found = rate_of_counts(self.path, settings, self.facts, **key._asdict())
-                self._rate, self._rate_key = _rate_data(found), key
-            return self._rate
+            prefix = counts.prefix
+            return self._rate(
+                prefix,
+                lambda: _rate_data(rate_of_counts(self.path, settings, self.facts, **prefix._asdict())),
+                now=True,
+            )
         return self._rate_of_all(state, settings, counts, held_out)
-
-    def _held_out(self, settings: HuntSettings) -> HeldOutTraffics:
-        """Return the rule that selects the traffic seeds that count; snapshots are read once."""
-        key = _sign(self.path / layout.SNAPSHOTS)
-        if self._held_out_rule is None or self._held_out_key != key:
-            self._held_out_rule, self._held_out_key = held_out_traffics(settings, [self.path]), key
-        return self._held_out_rule
 
     def _rate_of_all(
         self, state: HuntState, settings: HuntSettings, counts: TrialCounts, held_out: HeldOutTraffics
@@ -283,18 +264,15 @@ class HuntView:
         if counts.trials > _MAX_TRIALS_READ:
             why = f"it reads all trials, of which there are more than {_MAX_TRIALS_READ:,}"
             return {"why_not": f"{why}; run: {command_line('crashhunt', 'rate', self.path)}"}
-        began = time.monotonic()
-        key = (self._key, counts.trials)
-        if key != self._rate_key and (began >= self._rate_due or state.state != "running"):
+
+        def make() -> JsonObject:
             try:
                 with closing(Ledger(self.path / layout.LEDGER, read_only=True)) as ledger:
-                    found = rate_of_trials(self.path, settings, self.facts, ledger.plain_results(), held_out)
-                self._rate, self._rate_key = _rate_data(found), key
+                    return _rate_data(rate_of_trials(self.path, settings, self.facts, ledger.plain_results(), held_out))
             except HuntDirectoryError as error:
-                self._rate, self._rate_key = {"why_not": str(error)}, key
-            ended = time.monotonic()
-            self._rate_due = ended + (ended - began) / _MAX_SHARE_OF_TIME
-        return self._rate
+                return {"why_not": str(error)}
+
+        return self._rate((self._key, counts.trials), make, now=state.state != "running")
 
 
 def _rate_data(rate: CrashRate) -> JsonObject:
@@ -313,7 +291,7 @@ def _sign(path: Path) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def read_tail(path: Path, root: Path, most: int = _LOG_TAIL_BYTES) -> str:
+def read_tail(path: Path, root: Path) -> str:
     """Return the last lines of a text file; empty if the file is missing or outside of a folder.
 
     The file must lie inside ``root`` after links are resolved.
@@ -324,8 +302,8 @@ def read_tail(path: Path, root: Path, most: int = _LOG_TAIL_BYTES) -> str:
     try:
         with resolved.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - most))
-            text = file.read(most).decode("utf-8", "replace")
+            file.seek(max(0, size - _LOG_TAIL_BYTES))
+            text = file.read(_LOG_TAIL_BYTES).decode("utf-8", "replace")
     except OSError:
         return ""
-    return text if size <= most else text.partition("\n")[2]
+    return text if size <= _LOG_TAIL_BYTES else text.partition("\n")[2]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError
+from crashhunt.base.pacing import Paced
 from crashhunt.base.temporary import remove_at_once
 from crashhunt.crashes import (
     SIGNATURE_VERSION,
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from crashhunt.recording import Recording
     from crashhunt.trial import TrialResult
 
-_MAX_SHARE_OF_TIME = 0.05  # that grouping crashes for a screen may take
 _MAX_READ_LOGS = 200  # of crashes that are read for their types; a log takes 0.05 s
 
 
@@ -261,9 +261,8 @@ class Kinds:
         self._seen: set[Signature] = set()
         self._first: dict[tuple[Signature, Cause | None], int] = {}  # of what counts, its trial of the least number
         self._until: int | None = None
-        self._groups: tuple[Group, ...] | None = None
-        self._listed_crashes: tuple[Group, ...] = ()
-        self._due = 0.0
+        self._groups: Paced[tuple[Group, ...]] = Paced()
+        self._changes = 0  # of the groups
         self.newest = newest
         self.newest_trial: int | None = None
         there = {bundle.result.spec.number for bundle in crashes}  # it was killed before it had removed them
@@ -300,15 +299,12 @@ class Kinds:
         While a hunt is ``running``, groups some moments old are sufficient, as for a screen that is refreshed ten times
         a second. With 10,000 crashes, new groups would take too long.
         """
-        began = time.monotonic()
-        if running and self._groups is None and began < self._due:
-            return self._listed_crashes
-        if self._groups is None:
+
+        def make() -> tuple[Group, ...]:
             dropped = {words: len(numbers) for words, numbers in self.dropped.items()}
-            self._groups = groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
-            ended = time.monotonic()
-            self._listed_crashes, self._due = self._groups, ended + (ended - began) / _MAX_SHARE_OF_TIME
-        return self._groups
+            return groups_of((self._signed[number] for number in sorted(self._signed)), dropped)
+
+        return self._groups(self._changes, make, now=not running)
 
     def drop_excess(self, keep: int, *, final: bool = False) -> list[Bundle]:
         """Remove and return the crashes beyond the `keep` shortest of each crash type, or of each cause.
@@ -337,7 +333,7 @@ class Kinds:
                         self.dropped_judged.setdefault(str(group.signature), {})[str(number)] = answer
                     found.append(bundle)
         if found:
-            self._groups = None
+            self._changes += 1
         return found
 
     def _parts(self, group: Group, *, final: bool) -> list[list[Bundle]]:
@@ -447,7 +443,7 @@ class Kinds:
             number = bundle.result.spec.number
             if number in self._signed:
                 self._signed[number] = self._signed[number][0], bundle
-        self._groups = None
+        self._changes += 1
 
     def _add_signature(self, bundle: Bundle, recording: Recording | None = None) -> bool:
         """Add a crash; return whether its crash type is new."""
@@ -468,7 +464,7 @@ class Kinds:
         is_new = signature not in self._seen
         self._seen.add(signature)
         self._signed[number] = signature, bundle
-        self._groups = None
+        self._changes += 1
         self._count(number, signature, None)
         judgement = judgement_of(bundle) if signature in self._divisions else None
         if judgement is not None and not judgement.is_interrupted:

@@ -7,15 +7,15 @@ The pairs have an order that does not depend on results, namely hunt after hunt,
 
 from __future__ import annotations
 
-import math
 import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from crashhunt.base import layout
+from crashhunt.base.codec import plain
 from crashhunt.base.errors import HuntDirectoryError
-from crashhunt.base.json_types import finite_values
+from crashhunt.base.json_types import finite
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.plans import read_settings
 from crashhunt.statistics._comparison import why_unpaired
@@ -165,15 +165,15 @@ class GateReport:
         return {
             "verdict": self.verdict,
             "pairs": self.pairs,
-            "base": None if base is None else finite_values(base.to_json()),
-            "head": None if head is None else finite_values(head.to_json()),
+            "base": None if base is None else plain(base.to_json()),
+            "head": None if head is None else plain(head.to_json()),
             "difference": None if self.difference is None else self.difference._asdict(),
             "corpus": corpus,
             "compared": {"base": self.base, "head": self.head},
             "only_base": self.only_base,
             "only_head": self.only_head,
             "both": self.both,
-            "evidence": self.evidence if math.isfinite(self.evidence) else None,
+            "evidence": finite(self.evidence),
             "margin": self.margin,
             "confidence": self.confidence,
             "seed": self.seed,

@@ -7,11 +7,11 @@ small share of the time. A resumed hunt reads the number and the outcome of each
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from crashhunt.base.errors import UsageError
+from crashhunt.base.pacing import Paced
 from crashhunt.base.text import format_percent
 from crashhunt.disturbances import first_forcing
 from crashhunt.plans import rate_of, share_of
@@ -30,7 +30,7 @@ from crashhunt.statistics._rate_report import make_rate
 from crashhunt.trial import Forcing, Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from crashhunt.disturbances import DisturbanceSampler
@@ -47,38 +47,11 @@ if TYPE_CHECKING:
 WHY_NOT_UNTIL_RATE = "--until-rate ends the hunt by its crashes, so crashes by trials would be biased"
 """Why a hunt that is compared with a threshold has no estimate."""
 
-_MAX_SHARE_OF_TIME = 0.05  # that running intervals may take
 _LONGEST_PAUSE_S = 10.0  # the first interval takes long, because it imports SciPy
 _MAX_FACTORS = 64  # per trial there are two different units
 _EQUAL_TOLERANCE = (
     0.2  # relative difference from a bar that counts as none; it takes some 300 crashes to be certain of it
 )
-
-T = TypeVar("T")
-
-
-class Paced(Generic[T]):
-    """Caches a value that is expensive to compute, and computes it again only in a small share of the time."""
-
-    def __init__(self, make: Callable[[], T]) -> None:
-        self._make = make
-        self._made: tuple[object, T] | None = None
-        self._due = 0.0
-
-    def __call__(self, version: object, *, now: bool = False) -> T:
-        """Return the value, which may be out of date.
-
-        ``version`` is that of the data from which the value is computed. With ``now``, an outdated value is not
-        sufficient.
-        """
-        began = time.monotonic()
-        if self._made is not None and (self._made[0] == version or (began < self._due and not now)):
-            return self._made[1]
-        found = self._make()
-        ended = time.monotonic()
-        self._made = version, found
-        self._due = ended + min((ended - began) / _MAX_SHARE_OF_TIME, _LONGEST_PAUSE_S)
-        return found
 
 
 class RateWatch:
@@ -91,7 +64,7 @@ class RateWatch:
         self.rule, self.per, self.alpha = rule, per, alpha
         self._crash_on = crash_on
         self.sequence, self.counter = UnitSequence(rule), RateCounter(rule, per)
-        self._paced: Paced[RunningRate] = Paced(self._running)
+        self._paced: Paced[RunningRate] = Paced(_LONGEST_PAUSE_S)
 
     def add(self, result: TrialResult | Mapping[str, Any]) -> None:
         """Add a finished trial, as a result or as data from a ledger; the order of trials does not matter."""
@@ -116,7 +89,7 @@ class RateWatch:
         # A trial that waits for one of a lower number changes no count, but the reason why there is no rate.
         counted = sequence.valid + sequence.invalid + sequence.not_random + sequence.trained_on
         version = counted, sequence.excluded > 0
-        return self._paced(version, now=now)
+        return self._paced(version, self._running, now=now)
 
     def _running(self) -> RunningRate:
         counter, sequence = self.counter, self.sequence
@@ -386,7 +359,7 @@ class RareWatch:
         self._until = share_of(settings.run.until_error) if settings.run.until_error else 0.0
         self._read = 0  # trials
         self._group: list[TrialResult] = []  # the last root that was read, and its plain trials
-        self._paced: Paced[RunningRate] = Paced(lambda: self.estimate().running())
+        self._paced: Paced[RunningRate] = Paced(_LONGEST_PAUSE_S)
 
     @property
     def roots(self) -> int:
@@ -441,7 +414,7 @@ class RareWatch:
 
         Unless ``now``, the rate may be some moments old.
         """
-        return self._paced(self._read // TRIALS_PER_ROOT, now=now)
+        return self._paced(self._read // TRIALS_PER_ROOT, lambda: self.estimate().running(), now=now)
 
 
 def forcings_of(settings: HuntSettings, ledger: Ledger, sampler: DisturbanceSampler | None) -> Forcings | None:

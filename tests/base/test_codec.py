@@ -19,6 +19,7 @@ from crashhunt.base.codec import (
     essentials,
     not_understood,
     null_is,
+    plain,
     plain_types,
     prepare,
     written_if,
@@ -148,3 +149,8 @@ def test_a_reader_that_lacks_an_essential_field_knows_that_it_does_not_understan
     assert not_understood(["kind", "deep"], _Outer) == []
     assert not_understood(["kind", "deep", "later"], _Inner) == ["kind", "later"]
     assert not_understood([], _Inner) == []
+
+
+def test_numbers_that_json_does_not_have_are_null_at_every_depth():
+    found = plain({1: math.nan, "a": [math.inf, 2.5, (-math.inf, "x")], "b": {"c": True}})
+    assert found == {"1": None, "a": [None, 2.5, [None, "x"]], "b": {"c": True}}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import time
 from functools import cache
 from pathlib import Path
@@ -150,11 +149,6 @@ def test_answer_is_sent_again_only_when_it_has_changed(made):
     changed = ask(application, "/api/hunts/one", if_none_match=first.headers["etag"])
     assert (changed.status, changed.json["state"]) == (200, "crashed")
     assert changed.headers["etag"] != first.headers["etag"]
-
-
-def test_numbers_that_json_does_not_have_are_null():
-    found = _application._finite({1: math.nan, "a": [math.inf, 2.5, (-math.inf, "x")], "b": {"c": True}})
-    assert found == {"1": None, "a": [None, 2.5, [None, "x"]], "b": {"c": True}}
 
 
 def test_points_of_a_hunt_come_with_the_shares_of_their_sample(made):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from dashboard_hunts import View
 
-from crashhunt.base import layout
+from crashhunt.base import layout, pacing
 from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.dashboard import _crash_list as _crashes, _details
 from crashhunt.dashboard._crash_list import CrashList
@@ -162,7 +162,7 @@ def comparer(monkeypatch):
         return SimpleNamespace(to_json=lambda: data, pairs=pairs)
 
     monkeypatch.setattr(_details, "compare", compare)
-    monkeypatch.setattr(_details, "time", SimpleNamespace(monotonic=lambda: made.clock[0]))
+    monkeypatch.setattr(pacing, "time", SimpleNamespace(monotonic=lambda: made.clock[0]))
     return made
 
 

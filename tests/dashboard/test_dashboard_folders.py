@@ -357,7 +357,7 @@ def test_rate_of_all_trials_is_that_of_the_ledger_and_of_the_traffics_that_count
 
     monkeypatch.setattr(_hunt, "rate_of_trials", rate)
     monkeypatch.setattr(_hunt, "counts_suffice", lambda *_: False)
-    monkeypatch.setattr(HuntView, "_held_out", lambda self, settings: "held out")
+    monkeypatch.setattr(_hunt, "held_out_traffics", lambda settings, paths: "held out")
     assert view.rate(view.refresh()) == {"why_not": "odd"}
     assert given == [(view.path, view.settings, view.facts, [0, 1], "held out")]
 

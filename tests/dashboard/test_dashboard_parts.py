@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base import pacing
 from crashhunt.base.errors import HuntDirectoryError, UsageError
 from crashhunt.dashboard import _control, _hunt_page as _hunt, _server
 from crashhunt.dashboard._control import Jobs, stop_hunt
@@ -237,7 +238,7 @@ def view(tmp_path, monkeypatch):
         assert (path, read_only) == (tmp_path / "ledger.sqlite", True)
         return SimpleNamespace(plain_results=list, close=lambda: made.closed.append(1))
 
-    monkeypatch.setattr(_hunt, "time", SimpleNamespace(monotonic=lambda: made.clock[0]))
+    monkeypatch.setattr(pacing, "time", SimpleNamespace(monotonic=lambda: made.clock[0]))
     monkeypatch.setattr(_hunt, "rate_of_trials", read)
     monkeypatch.setattr(_hunt, "Ledger", ledger)
     monkeypatch.setattr(_hunt, "sums_of_probes", lambda ledger, facts: read() and {"probes": len(made.reads)})
@@ -272,7 +273,7 @@ def test_rate_that_reads_all_trials_takes_a_twentieth_of_the_time(view):
 
 
 def test_rate_needs_settings_and_trials_and_all_trials_where_counts_do_not_suffice(view, monkeypatch):
-    monkeypatch.setattr(view, "_held_out", lambda settings: None)
+    monkeypatch.setattr(_hunt, "held_out_traffics", lambda settings, paths: None)
     monkeypatch.setattr(_hunt, "counts_suffice", lambda settings, facts, held_out: False)
     state = SimpleNamespace(state="running")
     for settings, counts in ((None, 5), (SimpleNamespace(), None), (SimpleNamespace(), 0)):
@@ -284,9 +285,9 @@ def test_rate_needs_settings_and_trials_and_all_trials_where_counts_do_not_suffi
 
 def test_results_of_forks_are_summed_up_in_their_share_of_the_time(view):
     def copies(state="running", copies=True):
-        view.facts = {"copies": copies, "state": state}
+        view.facts, view._last = {"copies": copies, "state": state}, view.clock[0]
         view._read_copies("ledger")
-        return view._copies.get("probes")
+        return view._sums_of_copies.get("probes")
 
     assert copies() == {"probes": 1}
     view.clock[0] = 102.0 + 2.0 / 0.05 - 0.1
@@ -295,7 +296,7 @@ def test_results_of_forks_are_summed_up_in_their_share_of_the_time(view):
     assert copies() == {"probes": 2}
     assert copies("crashed") == {"probes": 3}
     assert copies(copies=False) is None
-    assert view._copies == {}
+    assert view._sums_of_copies == {}
 
 
 def test_time_of_the_last_activity_is_the_latest_that_is_known(view, tmp_path):
@@ -309,12 +310,16 @@ def test_time_of_the_last_activity_is_the_latest_that_is_known(view, tmp_path):
     assert view.active_at() == 9.0
 
 
-def test_tail_of_a_log_begins_with_a_whole_line(tmp_path):
+def test_tail_of_a_log_begins_with_a_whole_line(tmp_path, monkeypatch):
+    def tail(most):
+        monkeypatch.setattr(_hunt, "_LOG_TAIL_BYTES", most)
+        return read_tail(log, tmp_path)
+
     log = tmp_path / "run.log"
     log.write_text("one\ntwo\nthree\n")
-    assert read_tail(log, tmp_path) == read_tail(log, tmp_path, most=14) == "one\ntwo\nthree\n"
-    assert read_tail(log, tmp_path, most=13) == "two\nthree\n"
-    assert read_tail(log, tmp_path, most=7) == "three\n"
+    assert read_tail(log, tmp_path) == tail(14) == "one\ntwo\nthree\n"
+    assert tail(13) == "two\nthree\n"
+    assert tail(7) == "three\n"
     assert read_tail(tmp_path / "nothing", tmp_path) == ""
     (tmp_path / "inside").mkdir()
     assert read_tail(log, tmp_path / "inside") == ""

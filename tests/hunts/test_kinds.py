@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt.base import pacing
 from crashhunt.base.errors import UsageError
 from crashhunt.crashes import (
     Cause,
@@ -75,7 +76,7 @@ def test_a_screen_does_not_wait_for_groups_that_take_long(monkeypatch):
         return group(*given)
 
     monkeypatch.setattr(_crashes, "groups_of", slowly)
-    monkeypatch.setattr(_crashes, "time", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
+    monkeypatch.setattr(pacing, "time", SimpleNamespace(monotonic=lambda: now[0]))
     kinds = Kinds(0, [crash(1, "KeyError")])
     assert kinds.groups(running=True)[0].count == 1
     kinds.add(crash(2, "KeyError"), 1)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, strategies as st
 
+from crashhunt.base.pacing import Paced
 from crashhunt.plans import check_rate, rate_of
 from crashhunt.statistics import BarWatch, CountingRule, RateWatch, TrialFacts
 from crashhunt.statistics._anytime_interval import RateTest
@@ -332,9 +333,14 @@ def test_running_rate_names_the_trial_that_others_wait_for():
 
 def test_running_rate_is_made_again_only_where_something_has_changed():
     made = []
-    paced = Paced(lambda: made.append(1) or len(made))
-    assert [paced(1), paced(1), paced(1, now=True)] == [1, 1, 1]
-    assert paced(2, now=True) == 2
+    paced = Paced()
+
+    def make():
+        made.append(1)
+        return len(made)
+
+    assert [paced(1, make), paced(1, make), paced(1, make, now=True)] == [1, 1, 1]
+    assert paced(2, make, now=True) == 2
 
 
 @pytest.mark.parametrize(("bar", "needed_km"), [(10.0, 350.0), (1.0, 3_500.0), (0.1, 35_000.0)])
