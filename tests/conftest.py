@@ -41,10 +41,9 @@ from commands import CRASHHUNT, Begun, Commands
 from threadpoolctl import ThreadpoolController
 
 from crashhunt.base import reaper
-from crashhunt.base.integrity import describe_files, digest_of_data
 from crashhunt.native import HOW_TO_REBUILD, _core, outdated_modules
 from crashhunt.snapshots import _take
-from crashhunt.snapshots._snapshot import code_of_manifest
+from crashhunt.snapshots._snapshot import write_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
@@ -544,9 +543,7 @@ def rewritten(snapshot: Path, name: str, text: str) -> None:
     (snapshot / name).write_text(text)
     manifest = json.loads((snapshot / "manifest.json").read_text())
     del manifest["integrity"]
-    manifest["described"] = {kept: describe_files(snapshot)[kept] for kept in manifest["described"]}
-    manifest["authentication_code"] = code_of_manifest(manifest)
-    (snapshot / "manifest.json").write_text(json.dumps({**manifest, "integrity": digest_of_data(manifest)}))
+    write_manifest(snapshot, manifest)
 
 
 TOY = """

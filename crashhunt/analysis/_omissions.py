@@ -74,7 +74,7 @@ def find_omission(
     """
     old = not is_current_code(rerun)
     if old:
-        order = rerun.snapshot.environment().get("load_order")
+        order = rerun.snapshot.environment.get("load_order")
         rerun = replace(
             rerun, worker=replace(rerun.worker, scenario=with_recorded_load_order(rerun.worker.scenario, order))
         )

@@ -247,8 +247,8 @@ def _write_crash(
 
 
 def _scenario(snapshot: Snapshot, settings: HuntSettings) -> Scenario:
-    order = snapshot.environment().get("load_order")
-    return with_recorded_load_order(with_settings(snapshot.scenario(), settings), order)
+    order = snapshot.environment.get("load_order")
+    return with_recorded_load_order(with_settings(snapshot.scenario, settings), order)
 
 
 def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
@@ -267,7 +267,7 @@ def _verified_snapshot(snapshot: Snapshot) -> Snapshot:
 
 def _warnings(snapshot: Snapshot) -> tuple[str, ...]:
     """Return the differences in the environment because of which the same seed may result in other traffic."""
-    environment, scenario = snapshot.environment(), snapshot.scenario()
+    environment, scenario = snapshot.environment, snapshot.scenario
     changed = environment_changes(environment)
     names = (name for name in scenario.backend.versions if name in changed)
     found = [f"{name} was {changed[name][0]} and is {changed[name][1]}" for name in names]

@@ -219,7 +219,7 @@ def is_hunt_trusted(hunt: Path, snapshot: Snapshot) -> bool:
     """Return whether the code that a hunt's settings name may run without a confirmation by the user."""
     try:
         settings = read_settings(hunt / layout.HUNT)
-        same_scenario = settings.scenario == snapshot.settings().scenario
+        same_scenario = settings.scenario == snapshot.settings.scenario
         if same_scenario and not _unknown_names(settings, snapshot) and is_snapshot_trusted(snapshot):
             return True
     except CrashhuntError:
@@ -235,7 +235,7 @@ def trust_snapshot(snapshot: Snapshot, path: Path) -> TrustedOrigin:
         HuntDirectoryError: the entry cannot be written.
     """
     snapshot.verify()
-    runs = describe_code(snapshot, snapshot.settings())
+    runs = describe_code(snapshot, snapshot.settings)
     return add_trusted(snapshot.fingerprint(), path=str(path.resolve()), runs=runs)
 
 
@@ -244,11 +244,11 @@ def describe_code(snapshot: Snapshot, settings: HuntSettings) -> str:
     names = {agent.agent for agent in settings.agents.values()}
     names |= {oracle for oracle in settings.oracles if ":" in oracle}
     with suppress(CrashhuntError):  # a scenario that cannot be read runs nothing
-        names |= set(snapshot.scenario().modules())
+        names |= set(snapshot.scenario.modules())
     agents = ", ".join(sorted(names)) or "no agent"
     if not snapshot.has_code:
         return f"{agents}, as installed here or found from the current folder, in the scenario of {snapshot.digest}"
-    version = snapshot.environment().get("versions", {}).get("crashhunt", "of an unknown version")
+    version = snapshot.environment.get("versions", {}).get("crashhunt", "of an unknown version")
     return f"{agents} and crashhunt {version}, both from the snapshot {snapshot.digest}"
 
 
@@ -306,7 +306,7 @@ def _first_change(settings: HuntSettings, snapshot: Snapshot) -> str:
 
 def _has_known_texts(spec: TrialSpec, settings: HuntSettings, snapshot: Snapshot) -> bool:
     """Return whether all texts among a trial's arguments also occur in its hunt's settings or in its scenario."""
-    scenario = with_settings(snapshot.scenario(), settings)
+    scenario = with_settings(snapshot.scenario, settings)
     arguments = [*scenario.scenario_arguments().values()]
     for agent in scenario.agents:
         arguments += scenario.agent_arguments(agent).values()
@@ -321,7 +321,7 @@ def _unknown_names(settings: HuntSettings, snapshot: Snapshot) -> list[str]:
 
     Numbers may differ, so that the user can change them and replay the crash.
     """
-    known = snapshot.settings()
+    known = snapshot.settings
     agents = {agent.agent for agent in known.agents.values()}
     found = [agent.agent for agent in settings.agents.values() if agent.agent not in agents]
     plugins: tuple[tuple[Group, str, str, tuple[str, ...]], ...] = (

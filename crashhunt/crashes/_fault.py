@@ -393,7 +393,7 @@ def _verdict(findings: Iterable[FaultFinding]) -> Verdict:
 
 def _right_of_way_of(bundle: Bundle) -> RightOfWay | None:
     try:
-        scenario = snapshot_of(bundle).scenario()
+        scenario = snapshot_of(bundle).scenario
         ask = scenario.backend.right_of_way
         return ask(scenario) if ask is not None else None
     except (CrashhuntError, OSError):
@@ -411,7 +411,7 @@ def yielding_actor(bundle: Bundle, contact: ContactRecord | None) -> str:
 def stop_lines_of(bundle: Bundle) -> tuple[StopLine, ...]:
     """Return the stop lines of a crash's map; none if the simulator has none, or the scenario is not in the hunt."""
     try:
-        scenario = snapshot_of(bundle).scenario()
+        scenario = snapshot_of(bundle).scenario
         ask = scenario.backend.stop_lines
         return ask(scenario) if ask is not None else ()
     except (CrashhuntError, OSError):

@@ -214,7 +214,7 @@ class Hunt:
     def _run(self, ledger: Ledger, watch: Callable[[HuntStatus], None]) -> HuntReport:
         snapshot = self._code.take_snapshot(self.settings)
         roots = self._snapshot_options.roots if self._snapshot_options is not None else ()
-        trust_repositories(snapshot.environment().get("git", {}).keys() - {str(root.resolve()) for root in roots})
+        trust_repositories(snapshot.environment.get("git", {}).keys() - {str(root.resolve()) for root in roots})
         workers = settings_of_workers(self.settings, snapshot, self._place.scratch)
         self._conditions = HostConditions(workers)
         setup = HuntSetup(

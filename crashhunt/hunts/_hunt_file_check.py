@@ -166,7 +166,7 @@ def _check_settings(found: Checked, hunt: Path) -> HuntSettings | None:
         found.report(hunt / layout.HUNT, error.message, lost="what the hunt was asked", fix=fix)
     for snapshot in intact_snapshots(hunt):
         with suppress(CrashhuntError):
-            return snapshot.settings()
+            return snapshot.settings
     return None
 
 
@@ -292,9 +292,7 @@ _RERUN_FIX = "crashhunt check --salvage TO leaves it out, and the same hunt runs
 def _snapshot_faults(snapshot: Snapshot) -> list[str]:
     faults = snapshot.faults()
     if not faults:
-        snapshot.environment()
-        snapshot.settings()
-        snapshot.scenario()
+        _ = snapshot.environment, snapshot.settings, snapshot.scenario  # each is read here, and raises what is wrong
     return faults
 
 

@@ -153,7 +153,7 @@ def settings_again(settings: HuntSettings, snapshot: Snapshot, scratch: Path) ->
 def _settings(settings: HuntSettings, snapshot: Snapshot, scratch: Path) -> WorkerSettings:
     """Return the settings that are common to `settings_of_workers` and `settings_again`."""
     return WorkerSettings(
-        scenario=with_settings(snapshot.scenario(), settings),
+        scenario=with_settings(snapshot.scenario, settings),
         oracles=settings.oracles,
         crash_on=settings.crash_on,
         scratch=scratch,

@@ -326,7 +326,7 @@ class TrafficSurveyor:
     def _stored_survey(self) -> Scenario | None:
         with suppress(CrashhuntError, OSError):
             snapshot = latest_snapshot(self._directory)
-            return snapshot.scenario() if snapshot is not None else None
+            return snapshot.scenario if snapshot is not None else None
         return None
 
 

@@ -105,7 +105,7 @@ def _settings(hunt: Path) -> HuntSettings:
         return read_settings(hunt / layout.HUNT)
     except HuntDirectoryError:
         for snapshot in intact_snapshots(hunt):
-            return snapshot.settings()
+            return snapshot.settings
         raise
 
 

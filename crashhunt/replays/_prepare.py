@@ -128,13 +128,13 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
     warnings += [f"{name} was not in the snapshot, and may make a difference" for name in snapshot.additions()]
     settings = read_settings(bundle.hunt / layout.HUNT)
     settings = replace(settings, run=replace(settings.run, accelerate=settings.run.accelerate and options.accelerate))
-    scenario = with_settings(snapshot.scenario(), settings)
-    scenario = with_recorded_load_order(scenario, snapshot.environment().get("load_order"))
+    scenario = with_settings(snapshot.scenario, settings)
+    scenario = with_recorded_load_order(scenario, snapshot.environment.get("load_order"))
     warnings += _machine_warnings(scenario, snapshot)
     if code == "snapshot" and trusted:
         warnings += program_warnings(snapshot, [setup.agent for setup in scenario.agents.values()])
     runs = None if code == "log" or not trusted else snapshot.code if code == "snapshot" else ()
-    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings(), options.changes, code=runs)
+    spec, edits = edited_spec(bundle.result.spec, settings, snapshot.settings, options.changes, code=runs)
     warnings += edits.ignored
     if not options.scenario:
         _refuse_unsupported(scenario, spec)
@@ -177,7 +177,7 @@ def prepare(bundle: Bundle, options: ReplayOptions) -> Rerun:
 
 def _machine_warnings(scenario: Scenario, snapshot: Snapshot) -> Iterator[str]:
     """Yield what differs between the machine of the crash and this one, as text."""
-    environment = snapshot.environment()
+    environment = snapshot.environment
     for name, (then, now) in environment_changes(environment).items():
         yield f"{name} was {then} and is {now}"
     if changed := load_order_change(scenario, environment.get("load_order")):

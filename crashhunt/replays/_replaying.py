@@ -70,7 +70,7 @@ class ReplayReport(Serializable):
     @property
     def programs(self) -> Mapping[str, BinaryFacts] | None:
         """What identifies the recorded programs and libraries of agents, by the word that names each."""
-        return self.rerun.snapshot.environment().get("programs") or None
+        return self.rerun.snapshot.environment.get("programs") or None
 
     @property
     def steps_replayed(self) -> int:
@@ -121,7 +121,7 @@ def _judge(
     was, now = rerun.recorded.prologue, replayed.prologue
     if was != now:
         return "not_comparable", f"what is recorded is another: {_prologue_change(was, now)}"
-    environment = rerun.snapshot.environment()
+    environment = rerun.snapshot.environment
     if order := load_order_change(rerun.worker.scenario, environment.get("load_order")):
         return "not_comparable", f"the simulator differs: {order}"
     changed = environment_changes(environment)

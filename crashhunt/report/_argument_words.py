@@ -79,7 +79,7 @@ def argument_units(directory: Path, settings: HuntSettings) -> dict[tuple[str, s
     """
     try:
         found = latest_snapshot(directory)
-        scenario = found.scenario() if found is not None else None
+        scenario = found.scenario if found is not None else None
     except CrashhuntError:  # a page without units is better than none
         scenario = None
     units = {} if scenario is None else {("", name): setup.unit for name, setup in scenario.arguments.items()}

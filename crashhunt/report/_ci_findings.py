@@ -88,7 +88,7 @@ def _definition(snapshot: Path, driver: str) -> tuple[str, int]:
     """Return the file and the line of the class or function of the agent that drives."""
     kept = Snapshot(snapshot)
     try:
-        agents = kept.settings().agents
+        agents = kept.settings.agents
         module, _, attribute = agents[driver or next(iter(agents))].agent.partition(":")
         for root in kept.code:
             for file in (

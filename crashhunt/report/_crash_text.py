@@ -466,7 +466,7 @@ def _named(moment: Moment, nearest: Mapping[str, TableCell]) -> dict[str, object
 def programs_of(bundle: Bundle) -> dict[str, BinaryFacts]:
     """Return what identifies the programs and libraries of agents, by the word that names each."""
     try:
-        return snapshot_of(bundle).environment().get("programs", {})
+        return snapshot_of(bundle).environment.get("programs", {})
     except CrashhuntError:  # there is no snapshot, or it is damaged
         return {}
 

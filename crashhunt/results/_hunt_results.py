@@ -157,7 +157,7 @@ class HuntResults:
     @property
     def scenario(self) -> Scenario:
         """The scenario with the agents that drove."""
-        return with_settings(self._snapshot().scenario(), self.settings)
+        return with_settings(self._snapshot().scenario, self.settings)
 
     def results(self, *, outcomes: Sequence[str] = ()) -> Iterator[TrialResult]:
         """Yield the trials in the order of their numbers: all trials, or those with the given outcomes."""

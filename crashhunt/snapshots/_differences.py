@@ -77,7 +77,7 @@ def code_changes(then: Snapshot, now: Snapshot) -> CodeChanges:
             changed.append(name if was and is_now else f"{name} ({'new' if is_now else 'removed'})")
     if own:
         changed.append(f"crashhunt itself ({own} {'file' if own == 1 else 'files'})")
-    versions = differing_versions(then.environment(), now.environment())
+    versions = differing_versions(then.environment, now.environment)
     changed += [f"{name} {was} (now {is_now})" for name, (was, is_now) in versions.items()]
     return CodeChanges(tuple(changed), tuple(added))
 
@@ -153,7 +153,7 @@ def program_warnings(snapshot: Snapshot, locators: Iterable[str]) -> list[str]:
         facts = describe_binary(Path(files[word])) if word in files else None
         if facts is None:
             continue
-        recorded = snapshot.environment().get("programs", {}).get(word, facts)
+        recorded = snapshot.environment.get("programs", {}).get(word, facts)
         then, now = recorded.get("packages", {}), facts.get("packages", {})
         found += [
             f"the library {name} was of {package} and is of {now[name]}"
@@ -181,7 +181,7 @@ def _folders_of_today(snapshot: Snapshot, locators: Iterable[str]) -> dict[str, 
     """Return for each folder or module in the snapshot the folder or file from which today's code is imported."""
     files = snapshot.manifest["files"]
     found = {f"{layout.CODE}/{layout.PACKAGE.name}": layout.PACKAGE}
-    for place, original in snapshot.environment().get("origins", ()):
+    for place, original in snapshot.environment.get("origins", ()):
         if place != layout.CODE:
             if os.path.isdir(original):  # noqa: PTH112
                 found.setdefault(place, Path(original))

@@ -6,13 +6,13 @@ import platform
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from crashhunt.base.plugins import ImportedModules, distributions as installed
 from crashhunt.scenario import installed_backends
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from crashhunt.base.binaries import BinaryFacts
 
@@ -97,7 +97,11 @@ def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
 
 
 def _version_of(name: str) -> str:
-    return _name_and_version(metadata.distribution(name))[1]
+    """Return the version of a distribution; empty if it is not installed."""
+    try:
+        return _name_and_version(metadata.distribution(name))[1]
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 def _top_level_modules(distribution: metadata.Distribution) -> set[str]:
@@ -117,36 +121,24 @@ def versions() -> dict[str, str]:
     for name in dict.fromkeys(
         (*_VERSIONED, *(name for _, backend in installed_backends() for name in backend.versions))
     ):
-        try:
-            found[name] = _version_of(name)
-        except metadata.PackageNotFoundError:
-            continue
+        if version := _version_of(name):
+            found[name] = version
     return found
 
 
 def environment_changes(recorded: Environment) -> dict[str, tuple[str, str]]:
     """Return the versions that differ from an ``environment.json``, each as (recorded, current), by name."""
-    changes = {}
-    for name, then, now in (
-        ("python", recorded.get("python"), platform.python_version()),
-        ("implementation", recorded.get("implementation"), platform.python_implementation()),
-        ("machine", recorded.get("machine"), platform.machine()),
-    ):
-        if then not in (None, now):
-            changes[name] = (str(then), now)
-    distributions = recorded.get("distributions", {})
-    for name in recorded.get("loaded", ()):
-        try:
-            now = _version_of(name)
-        except metadata.PackageNotFoundError:
-            now = "not installed"
-        then = distributions.get(name, now)
-        if then != now and name != "crashhunt":  # crashhunt itself comes from the snapshot
-            changes[name] = (str(then), now)
-    return changes
+    loaded = recorded.get("loaded", ())
+    now = {
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "machine": platform.machine(),
+        "distributions": {name: version for name in loaded if (version := _version_of(name))},
+    }
+    return differing_versions(recorded, now)
 
 
-def differing_versions(then: Environment, now: Environment) -> dict[str, tuple[str, str]]:
+def differing_versions(then: Environment, now: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     """Return the versions that differ between two recorded environments, each as (then, now), by name.
 
     Only distributions that the earlier process had loaded count, without crashhunt, whose code is in the snapshot.

@@ -123,32 +123,23 @@ class Snapshot:
         found = self.manifest["argument_files"]
         return {value: str((self.path / place).resolve()) for value, place in found.items()}
 
-    def scenario(self) -> Scenario:
-        """Return the scenario that the snapshot contains; it is read only once."""
-        return self._scenario
-
     @cached_property
-    def _scenario(self) -> Scenario:
+    def scenario(self) -> Scenario:
+        """The scenario that the snapshot contains."""
         return load_scenario(self.path / layout.SCENARIO_FILES / layout.SCENARIO, kept=True)
 
-    def settings(self) -> HuntSettings:
-        """Return the settings of the hunt that the snapshot contains; they are read only once."""
-        return self._settings
-
     @cached_property
-    def _settings(self) -> HuntSettings:
+    def settings(self) -> HuntSettings:
+        """The settings of the hunt that the snapshot contains."""
         return read_settings(self.path / layout.HUNT)
 
+    @cached_property
     def environment(self) -> Environment:
-        """Return the recorded environment; it is read only once.
+        """The recorded environment.
 
         Raises:
             BundleError: the file is missing or damaged.
         """
-        return self._environment
-
-    @cached_property
-    def _environment(self) -> Environment:
         file = self.path / layout.ENVIRONMENT
         try:
             found = read_object(file, Environment)
@@ -291,9 +282,12 @@ def digest_of_manifest(manifest: Manifest) -> str:
     return digest_of_described(manifest["files"], plain_data=[manifest["paths"], manifest["argument_files"], *more])
 
 
-def code_of_manifest(manifest: Manifest) -> str:
-    """Return the authentication code of a manifest, which covers all files by their digests."""
-    return authentication_code("snapshot", _authenticated(manifest))
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the manifest of a snapshot, with its descriptions and an authentication code that covers all files."""
+    manifest["described"] = describe_files(folder)
+    manifest["authentication_code"] = authentication_code("snapshot", _authenticated(manifest))
+    manifest["integrity"] = digest_of_data(manifest)
+    (folder / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
 
 
 def _authenticated(manifest: Manifest) -> dict[str, object]:
@@ -351,7 +345,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
         (final / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(snapshot.path / name, final / name)
     shutil.copyfile(snapshot.path / layout.HUNT, final / layout.HUNT)
-    environment = json.dumps(environment_of_simulation(snapshot.environment()), indent=1)
+    environment = json.dumps(environment_of_simulation(snapshot.environment), indent=1)
     (final / layout.ENVIRONMENT).write_text(environment, encoding="utf-8")
     manifest: Manifest = {
         "schema": SCHEMA,
@@ -359,9 +353,7 @@ def without_code(snapshot: Snapshot, snapshots: Path) -> Snapshot:
         "argument_files": {},
         "left_out": [],
         "files": kept,
-        "described": describe_files(final),
+        "described": {},
     }
-    manifest["authentication_code"] = code_of_manifest(manifest)
-    manifest["integrity"] = digest_of_data(manifest)
-    (final / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    write_manifest(final, manifest)
     return Snapshot(final)

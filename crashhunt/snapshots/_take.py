@@ -29,15 +29,15 @@ from crashhunt.base.calls import clear_constructor
 from crashhunt.base.errors import BundleError, SnapshotError, UsageError, remedy
 from crashhunt.base.exceptions import INSTALLED_FOLDERS
 from crashhunt.base.files import put_in_place, sync_folder, sync_tree
-from crashhunt.base.git import query
-from crashhunt.base.integrity import FileEntry, describe_files, digest_of_content, digest_of_data, digest_of_file
+from crashhunt.base.git import query, work_tree
+from crashhunt.base.integrity import FileEntry, digest_of_content, digest_of_file
 from crashhunt.base.opened_files import output_files
 from crashhunt.base.process_owners import this_process
 from crashhunt.base.temporary import remove_ended, temporary_beside
 from crashhunt.plans import HuntSettings, SnapshotChoices, core_of, imported_by, write_settings
 from crashhunt.scenario import Scenario, as_plain_data, load_order_of
 from crashhunt.snapshots._environment import Environment, differing_versions, environment
-from crashhunt.snapshots._snapshot import SCHEMA, Manifest, Snapshot, code_of_manifest, digest_of_manifest
+from crashhunt.snapshots._snapshot import SCHEMA, Manifest, Snapshot, digest_of_manifest, write_manifest
 from crashhunt.trial import Choice, Constant
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def find_sources(imported: ImportedModules, *, roots: Sequence[Path] = (), witho
     # A replay never reads the pages of the guide.
     pages = f"{layout.CODE}/crashhunt/guide/"
     found.files = {at: file for at, file in found.files.items() if not (at.startswith(pages) and at.endswith(".md"))}
-    work_tree_of = cache(_work_tree_of)  # a project has many modules in one folder, and git takes milliseconds
+    work_tree_of = cache(work_tree)  # a project has many modules in one folder, and git takes milliseconds
     for name in sorted(names - {"crashhunt"}):
         place = places.get(name)
         if place is None:
@@ -170,12 +170,6 @@ def _walk(folder: Path) -> Iterator[str]:
         for name in sorted(files):
             if os.path.splitext(name)[1] != ".pyc" and os.path.isfile(os.path.join(parent, name)):  # noqa: PTH113, PTH118, PTH122
                 yield name if below == "." else f"{below}/{name}"
-
-
-def _work_tree_of(folder: Path) -> Path | None:
-    """Return the git work tree that contains a folder, or None."""
-    top = query(folder, "rev-parse", "--show-toplevel")
-    return None if top is None else Path(os.fsdecode(top.rstrip(b"\n"))).resolve()
 
 
 def _listing_that_has(tree: Path, path: Path, found: Sources) -> tuple[Path, list[str]] | None:
@@ -272,7 +266,7 @@ def _take_root(root: Path, imported: ImportedModules, found: Sources, without: P
         raise SnapshotError(f"--snapshot-root {str(root)!r} does not exist", fix="correct the path")
     # The code finds a file at its place in the project, such as a library that git ignores.
     homes = [(origin, place) for place, origin in found.origins if path.is_relative_to(origin) and str(path) != origin]
-    if homes and _work_tree_of(path if path.is_dir() else path.parent) != path:
+    if homes and work_tree(path if path.is_dir() else path.parent) != path:
         for origin, place in [home for home in homes if home[1] != layout.CODE] or homes[:1]:  # a submodule has two
             base = f"{place}/{path.relative_to(origin).as_posix()}"
             names = [""] if path.is_file() else [f"/{name}" for name in _walk(path)]
@@ -414,7 +408,7 @@ def _build(
     }
     final = _name(manifest, conditions, building)
     if _is_usable(final, stored):
-        versions = differing_versions(Snapshot(final).environment(), around)
+        versions = differing_versions(Snapshot(final).environment, around)
         if not versions:
             return Snapshot(final)
         # The same files with another NumPy or SUMO are another condition of trials.
@@ -430,10 +424,7 @@ def _build(
     if (load_order := load_order_of(scenario)) is not None:
         facts["load_order"] = load_order
     (building / layout.ENVIRONMENT).write_text(json.dumps(facts, indent=1), encoding="utf-8")
-    manifest["described"] = describe_files(building)
-    manifest["authentication_code"] = code_of_manifest(manifest)
-    manifest["integrity"] = digest_of_data(manifest)
-    (building / layout.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    write_manifest(building, manifest)
     sync_tree(building)
     put_in_place(building, final)  # an existing snapshot is equal, damaged, or taken by another user
     sync_folder(final.parent)
@@ -492,7 +483,7 @@ def _program_files(settings: HuntSettings, found: Sources, takes_code: bool, hun
     places: dict[str, str] = {}
     locators = sorted({agent.agent for agent in settings.agents.values() if is_program(agent.agent)})
     for number, (word, path) in enumerate(pair for locator in locators for pair in files_of(locator).items()):
-        tree = _work_tree_of(path.parent) if takes_code else None
+        tree = work_tree(path.parent) if takes_code else None
         if tree is not None and path.resolve().is_relative_to(tree):
             if tree not in found.trees:
                 _take_tree(tree, list(_listed(tree)), found, imports=(), without=hunt)

@@ -76,7 +76,7 @@ def with_original_paths(text: str, snapshot: Snapshot) -> str:
 
 
 def _origins(snapshot: Snapshot) -> list[tuple[str, str]]:
-    return [(str(place), str(original)) for place, original in snapshot.environment().get("origins", ())]
+    return [(str(place), str(original)) for place, original in snapshot.environment.get("origins", ())]
 
 
 def _paths_in(text: str, snapshot: Snapshot) -> Iterator[Path]:

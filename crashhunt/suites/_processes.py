@@ -243,7 +243,7 @@ def _planned(folder: Path, request: Request, machine: Given) -> tuple[Scenario, 
         if not begun:
             return scenario, settings, code.imported
     else:
-        scenario = snapshot.scenario()
+        scenario = snapshot.scenario
     settings = read_settings(folder / layout.HUNT)
     if trials is not None:
         settings = replace(settings, trials=trials)

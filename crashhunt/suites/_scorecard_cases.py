@@ -451,7 +451,7 @@ def _read(group: CaseGroup, directory: Path) -> ScorecardHunt:
             "snapshot": "" if snapshot is None else snapshot.digest,
             "trials": len(ran),
             "trials_digest": digest.hexdigest()[:32],
-            "versions": {} if snapshot is None else dict(snapshot.environment()["versions"]),
+            "versions": {} if snapshot is None else dict(snapshot.environment["versions"]),
         },
         units={name: one.unit for name, one in scenario.arguments.items()},
     )

@@ -262,7 +262,7 @@ def describe_finished(directory: Path) -> str:
     changed: dict[str, None] = {}
     for snapshot in {found.digest: found for hunt in hunts if (found := latest_snapshot(hunt)) is not None}.values():
         with suppress(CrashhuntError, OSError):  # a damaged snapshot is reported by `check`
-            agents = [setup.agent for setup in snapshot.scenario().agents.values()]
+            agents = [setup.agent for setup in snapshot.scenario.agents.values()]
             changed |= dict.fromkeys(code_differences(snapshot, agents) or ())
     if not hunts:
         return ""

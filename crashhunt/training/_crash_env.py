@@ -103,7 +103,7 @@ class CrashEnv(gymnasium.Env[Any, Any]):
         if process is None:
             snapshot = snapshot_of(self._training[0].bundle)
             snapshot.verify()
-            process = snapshot.scenario().backend.one_per_process
+            process = snapshot.scenario.backend.one_per_process
         self._episodes: CrashEpisodes | _RemoteCrashEpisodes
         self._episodes = _RemoteCrashEpisodes(*words) if process else CrashEpisodes(*words)
         self.agent = self._episodes.agent

@@ -204,7 +204,7 @@ class _Stage:
         rerun = prepare(bundle, ReplayOptions(code="current"))
         worker = rerun.worker
         scenario = worker.scenario
-        self.name, self.title = Path(rerun.snapshot.settings().scenario).name, str(bundle.hunt)
+        self.name, self.title = Path(rerun.snapshot.settings.scenario).name, str(bundle.hunt)
         if agent and agent not in scenario.agents:
             raise UsageError(f"there is no controlled vehicle {agent!r}", fix=one_of(agent, scenario.agents))
         self.agent = agent or next(iter(scenario.agents))

@@ -76,7 +76,7 @@ def test_programs_that_cannot_run_here_are_reported_in_one_line_each(program, tm
     file = program("--enable-new-dtags")
     copies = {"./main": str(file)}
     recorded = {}
-    snapshot = SimpleNamespace(argument_files=copies, environment=lambda: {"programs": recorded})
+    snapshot = SimpleNamespace(argument_files=copies, environment={"programs": recorded})
     assert program_warnings(snapshot, ["exec:./main", "lib:./it's.so", "crashhunt.agents:RandomAgent"]) == []
     for name, package in describe_binary(file).get("packages", {}).items():
         recorded["./main"] = {"packages": {name: "libc 1"}}

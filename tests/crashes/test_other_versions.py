@@ -142,17 +142,17 @@ def test_a_snapshot_of_a_later_version_is_read(hunt, data):
     (snapshot.path / "manifest.json").write_text(json.dumps(signed(manifest)))
     again = Snapshot(snapshot.path)
     assert again.faults() == []
-    assert again.settings() == before.settings()
-    assert again.environment() == later
-    assert environment_changes(again.environment()) == environment_changes(environment)
-    assert again.scenario().agents == before.scenario().agents
+    assert again.settings == before.settings
+    assert again.environment == later
+    assert environment_changes(again.environment) == environment_changes(environment)
+    assert again.scenario.agents == before.scenario.agents
     place = snapshot.path / "scenario" / "scenario.toml"
     said = tomllib.loads((original / "scenario" / "scenario.toml").read_text())
     said |= {f"later {n}": data.draw(plain) for n in range(2)}
     said["agents"]["ego"]["later"] = data.draw(plain)
     place.write_text(tomli_w.dumps(said))
-    kept = dataclasses.replace(Snapshot(snapshot.path).scenario(), folder=before.scenario().folder)
-    assert kept == before.scenario()
+    kept = dataclasses.replace(Snapshot(snapshot.path).scenario, folder=before.scenario.folder)
+    assert kept == before.scenario
     crossed = dataclasses.replace(worker(hunt), scenario=kept).to_json()["scenario"]
     assert later_keys(crossed) == later_keys(said)  # for the worker of the version that has written them
     assert crossed["agents"]["ego"]["later"] == said["agents"]["ego"]["later"]
@@ -201,9 +201,9 @@ def test_an_archive_of_a_later_version_is_read(hunt, tmp_path):
 
 def worker(hunt):
     snapshot = Snapshot(next((hunt / "snapshots").iterdir()))
-    settings = snapshot.settings()
+    settings = snapshot.settings
     return WorkerSettings(
-        scenario=with_settings(snapshot.scenario(), settings),
+        scenario=with_settings(snapshot.scenario, settings),
         oracles=settings.oracles,
         crash_on=settings.crash_on,
         scratch=hunt,

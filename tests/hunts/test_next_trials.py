@@ -366,7 +366,7 @@ def test_root_draws_disturbances_of_the_steps_before_its_first_forced_onset():
 
 def test_workers_do_only_what_the_hunt_asks_for(tmp_path):
     toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    snapshot = SimpleNamespace(scenario=lambda: toy, code=("code",), argument_files={})
+    snapshot = SimpleNamespace(scenario=toy, code=("code",), argument_files={})
     plain = settings("random")
     plain = replace(plain, run=replace(plain.run, warm_copies=3, timeout_s=7.0), disturb={"brake": 0.1})
 

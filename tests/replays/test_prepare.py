@@ -94,7 +94,7 @@ def prepared(monkeypatch, tmp_path):
     )  # fmt: skip
     snapshot = SimpleNamespace(
         faults=lambda: given.faults, verify=lambda: given.asked.append("verified"), additions=lambda: given.additions,
-        scenario=lambda: scenario, environment=lambda: given.environment, settings=lambda: "original",
+        scenario=scenario, environment=given.environment, settings="original",
         code=("snapshot/code",), argument_files={"w": "w.npz"},
     )  # fmt: skip
     recorded = SimpleNamespace(

@@ -30,7 +30,7 @@ def judge(monkeypatch):
         backend = SimpleNamespace(versions=versions)
         rerun = SimpleNamespace(**{
             "recorded": SimpleNamespace(prologue=PROLOGUE), "code": "snapshot", "edits": (), "other_traffic": (),
-            "snapshot": SimpleNamespace(environment=dict), "bundle": SimpleNamespace(is_near_miss=near_miss),
+            "snapshot": SimpleNamespace(environment={}), "bundle": SimpleNamespace(is_near_miss=near_miss),
             "worker": SimpleNamespace(crash_on=("collision",), scenario=SimpleNamespace(backend=backend)), **given,
         })  # fmt: skip
         return _replay._judge(rerun, SimpleNamespace(prologue=now), result, divergence, whole=whole)
@@ -120,7 +120,7 @@ def report(verdict, result=CRASH, divergence=None):
         edits=("speed was 5",),
         warnings=("numpy",),
         recorded=SimpleNamespace(steps=30),
-        snapshot=SimpleNamespace(environment=dict),
+        snapshot=SimpleNamespace(environment={}),
     )
     recording = SimpleNamespace(steps=29)
     return ReplayReport(rerun=rerun, verdict=verdict, replayed=result, recording=recording, divergence=divergence)

@@ -86,6 +86,7 @@ def test_the_place_of_a_collision_is_where_the_agent_is_defined(tmp_path, groups
             assert path == snapshot
             self.code = (str(snapshot / "code"), str(code))
 
+        @property
         def settings(self):
             driver = type("Driver", (), {"agent": "planner:Planner"})
             return type("Settings", (), {"agents": {"ego": driver}})

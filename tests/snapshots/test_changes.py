@@ -28,7 +28,7 @@ def snapshot(files=None, *, conditions=None, arguments=("models/weights.zip",), 
     }
     found = SimpleNamespace(manifest=manifest, conditions=conditions or {})
     found.is_described = bool(paths) or any("/" in name for name in found.conditions)
-    found.environment = lambda: ENVIRONMENT | environment
+    found.environment = ENVIRONMENT | environment
     return found
 
 

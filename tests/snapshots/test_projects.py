@@ -90,7 +90,7 @@ def test_work_tree_is_kept_as_it_is_and_nothing_else(project, take):
     assert any("outside" in line for line in snapshot.manifest["left_out"])
     assert snapshot.manifest["files"][f"{BASE}/src/planner/tuning.py"]["size"] == len("LAST = 20\n")
     assert "+LAST = 20" in (snapshot.path / "git.diff").read_text()
-    environment = snapshot.environment()
+    environment = snapshot.environment
     assert environment["git"] == {str(project): git(project, "rev-parse", "HEAD").strip()}
     assert {"libsumo", "numpy"} <= set(environment["distributions"])
     assert environment["python"]
@@ -148,12 +148,12 @@ def test_equal_code_is_stored_once_and_up_to_a_limit(project, take):
 def test_other_versions_of_libraries_make_another_snapshot(take, monkeypatch):
     first = take()
     assert "conditions" not in first.manifest
-    monkeypatch.setattr(_take, "environment", lambda _: {**first.environment(), "python": "9.9"})
+    monkeypatch.setattr(_take, "environment", lambda _: {**first.environment, "python": "9.9"})
     other = take()
     assert other.digest != first.digest
     assert (other.conditions, other.manifest["files"]) == ({"python": "9.9"}, first.manifest["files"])
     other.verify()
-    assert code_changes(first, other).changed == (f"python {first.environment()['python']} (now 9.9)",)
+    assert code_changes(first, other).changed == (f"python {first.environment['python']} (now 9.9)",)
     assert take().digest == other.digest
     monkeypatch.undo()
     assert take().digest == first.digest

@@ -43,6 +43,7 @@ def test_git_is_asked_once_for_each_folder_of_a_project(tmp_path, monkeypatch):
         return query(folder, *arguments)
 
     monkeypatch.setattr("crashhunt.snapshots._take.query", counting)
+    monkeypatch.setattr("crashhunt.base.git.query", counting)
     kept = find_sources(ImportedModules.here([], ["driver_one", "driver_two"])).files
     base = f"code/@{tmp_path.name}"
     assert {f"{base}/driver_one.py", f"{base}/driver_two.py"} <= set(kept)

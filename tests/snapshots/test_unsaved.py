@@ -28,7 +28,7 @@ def project(tmp_path, monkeypatch):
     make_repository(tree)
     monkeypatch.chdir(tree)
     snapshot = SimpleNamespace(
-        path=copy, environment=lambda: {"origins": [["code/@my project", str(tree)]]}, argument_files={"a.npz": "x"},
+        path=copy, environment={"origins": [["code/@my project", str(tree)]]}, argument_files={"a.npz": "x"},
         manifest={"files": {"code/@my project/agent.py": {}}},
     )  # fmt: skip
     return SimpleNamespace(tree=tree, copy=copy / "code" / "@my project", snapshot=snapshot, folder=tmp_path)

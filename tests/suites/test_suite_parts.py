@@ -122,7 +122,7 @@ def test_hunt_that_has_begun_keeps_its_settings_and_takes_more_trials(hunt, monk
         planned.append(request.run)
         return "new scenario", "new settings", code
 
-    snapshot = SimpleNamespace(scenario=lambda: "kept scenario")
+    snapshot = SimpleNamespace(scenario="kept scenario")
     monkeypatch.setattr(_processes, "plan_with_code", plan)
     monkeypatch.setattr(_processes, "latest_snapshot", lambda folder: snapshot)
     monkeypatch.setattr(_processes, "with_settings", lambda scenario, given: (scenario, given.trials))
@@ -355,7 +355,7 @@ def test_hunts_of_a_suite_run_until_they_have_ended(tmp_path, monkeypatch):
 
 def test_finished_hunts_that_a_suite_does_not_run_again_are_reported_with_changed_files(tmp_path, monkeypatch):
     states = ["queued", "finished", "crashed", "error"]
-    snapshot = SimpleNamespace(digest="d", scenario=lambda: SimpleNamespace(agents={"a": SimpleNamespace(agent="m:A")}))
+    snapshot = SimpleNamespace(digest="d", scenario=SimpleNamespace(agents={"a": SimpleNamespace(agent="m:A")}))
     compared, changed = [], None
     monkeypatch.setattr(_suite, "hunt_state", lambda hunt: SimpleNamespace(state=states[hunt]))
     monkeypatch.setattr(_suite, "latest_snapshot", lambda hunt: snapshot)

@@ -90,7 +90,7 @@ def _run_again(hunt: Path, *, permute: bool) -> tuple[Counter[str], int, list[st
     for was, digest in wanted:
         snapshot, number = Snapshot(hunt / layout.SNAPSHOTS / digest), was.spec.number
         with tempfile.TemporaryDirectory() as folder:
-            settings = settings_again(snapshot.settings(), snapshot, Path(folder))
+            settings = settings_again(snapshot.settings, snapshot, Path(folder))
             if permute:  # the new process loads the allocator, this one does not
                 os.environ |= {"LD_PRELOAD": str(build_allocator(Path(folder))), "HEAP_ORDER": str(number + 1)}
             (alone,) = run_alone(settings, was.spec)
