@@ -8,7 +8,9 @@ from typing import Any, Protocol, TypeGuard
 import gymnasium
 import numpy as np
 
+from crashhunt.base.errors import ActionError, UnusableValueError
 from crashhunt.base.foreign_code import members, supports, truth_of
+from crashhunt.simulators import action_form, native
 
 _STEP_PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 _FIX = "return a bool for each agent"
@@ -74,13 +76,16 @@ class OneLearner(gymnasium.Env[Any, Any]):
         policy: Function that returns the action of another agent, given its name, observation, action space and random
             generator. Without this function, the other agents act at random, within the mask of possible actions if the
             environment provides a mask.
+        policy_name: The name of the function, for error messages.
     """
 
-    def __init__(self, parallel: Any, learner: str = "", policy: Callable[..., object] | None = None) -> None:
+    def __init__(
+        self, parallel: Any, learner: str = "", policy: Callable[..., object] | None = None, policy_name: str = ""
+    ) -> None:
         agents = {str(name): name for name in parallel.possible_agents}
         self._parallel = parallel
         self._learner = agents[learner or next(iter(agents))]
-        self._policy = policy
+        self._policy, self._policy_name = policy, policy_name
         self.observation_space = parallel.observation_space(self._learner)
         self.action_space = parallel.action_space(self._learner)
         self._seen: Mapping[Any, Any] = {}
@@ -134,7 +139,14 @@ class OneLearner(gymnasium.Env[Any, Any]):
             mask = seen.get("action_mask")
         if self._policy is None:
             return _random_action(space, self.np_random, mask)
-        return self._policy(str(name), seen, space, self.np_random)
+        action = self._policy(str(name), seen, space, self.np_random)
+        if space.contains(action):
+            return action
+        try:
+            return native(form := action_form(space), form.encode(action))
+        except ActionError as error:
+            what = f"gym.others = {self._policy_name!r} returned for {str(name)!r}"
+            raise UnusableValueError(f"{what}: {error.message}", fix=error.fix) from None
 
 
 def _random_action(space: Any, rng: np.random.Generator, mask: Any = None) -> object:

@@ -280,7 +280,8 @@ class GymSimulator:
         """
         array = self._form.encode(observation)
         if not self._form.contains(observation, array):
-            what = "outside its own observation space"
+            place = self._form.misfit(observation)
+            what = f"outside its own observation space{f', by its part {place}' if place else ''}"
             if has_nan(observation):
                 what = "that contains NaN"
             self._notice(f"the environment {self._setup.id!r} shows its agent an observation {what}")
@@ -375,7 +376,7 @@ class GymSimulator:
                     where=self._scenario.origin,
                 )
             with _CONSTRUCTOR:
-                made = OneLearner(made, self._setup.learner, self._others)
+                made = OneLearner(made, self._setup.learner, self._others, self._setup.others)
         elif self._setup.learner or self._setup.others:
             fix = "remove gym.learner and gym.others"
             raise self._mistake(

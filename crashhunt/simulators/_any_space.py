@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _MAX_ORIGINALS: Final = 256  # objects of a user's classes that may be needed again, because an agent sees them late
 _OPAQUE_MARK: Final = b'{"opaque":'  # in the text of a value with a part that cannot be restored; texts escape quotes
+_ABSENT: Final = type("_Absent", (), {"__repr__": lambda _: "absent"})()  # for a part that an observation lacks
 _SPACE_BOUNDARY = Boundary(Party.ENVIRONMENT, "space conversion")
 _ACTION_BOUNDARY = Boundary(Party.ENVIRONMENT, "action conversion")
 
@@ -64,7 +66,9 @@ class ObservationForm:
             if self.flattened:
                 with _quiet():
                     observation = self._flat(observation)
-            return np.array(observation, self._dtype).reshape(self.space.shape or ())
+            array = np.array(observation, self._dtype)
+            shape = self.space.shape or ()
+            return array if array.shape == shape else _reshaped(array, shape)
 
     def restore(self, array: NDArray[np.generic]) -> object:
         """Return the observation that the agent receives, from its array."""
@@ -74,17 +78,61 @@ class ObservationForm:
 
     def contains(self, observation: object, array: NDArray[np.generic]) -> bool:
         """Return whether an observation lies inside the environment's observation space."""
-        if self.structured:
-            with _SPACE_BOUNDARY, _quiet():
+        with _SPACE_BOUNDARY, _quiet():
+            if self.structured:
                 return bool(self.original.contains(observation))
-        return bool(self.space.contains(array))
+            return bool(self.space.contains(array)) and _has_values_of(array, observation)
+
+    def misfit(self, observation: object) -> str:
+        """Return the place of the first part of an observation that lies outside its space, such as ``['image']``."""
+        with _SPACE_BOUNDARY, _quiet():
+            return _misfit(self.original, observation)[0]
 
     def _flat(self, observation: object) -> object:
-        flat = spaces.flatten(self.original, observation)
-        # Outside the space, a number may become another one without an error: a Discrete -1 becomes the largest.
-        if not self.original.contains(observation) and not _equal(spaces.unflatten(self.original, flat), observation):
-            raise ValueError(f"the observation {describe_value(observation)} does not have the form of its space")
-        return flat
+        with suppress(KeyError, TypeError, ValueError, IndexError):  # of an observation without the form of the space
+            flat = spaces.flatten(self.original, observation)
+            # Outside the space, a number may become another one without an error: a Discrete -1 becomes the largest.
+            if self.original.contains(observation) or _equal(spaces.unflatten(self.original, flat), observation):
+                return flat
+        path, space, part = _misfit(self.original, observation)
+        form = f", of shape {part.shape}" if isinstance(part, np.ndarray) and part.shape != space.shape else ""
+        raise ValueError(f"observation{path} does not have the form of {space}: it is {describe_value(part)}{form}")
+
+
+def _misfit(space: Space[Any], value: Any, path: str = "") -> tuple[str, Space[Any], Any]:
+    """Return place, space and value of the first part of a value that lies outside its space; the part may be absent.
+
+    The place of the whole value is empty.
+    """
+    parts: Mapping[Any, Space[Any]] = {}
+    if isinstance(space, spaces.Dict) and isinstance(value, Mapping):
+        parts = space.spaces
+    elif isinstance(space, spaces.Tuple) and isinstance(value, tuple | list) and len(value) == len(space.spaces):
+        parts = dict(enumerate(space.spaces))
+    for key, inner in parts.items():
+        part = value[key] if isinstance(space, spaces.Tuple) or key in value else _ABSENT
+        if part is _ABSENT or not inner.contains(part):
+            return _misfit(inner, part, f"{path}[{key!r}]")
+    return path, space, value
+
+
+def _reshaped(array: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.generic]:
+    """Return an array with another shape, if no axis is exchanged with another one.
+
+    Raises:
+        ValueError: the shapes differ by more than axes of length 1, and neither array has a single axis.
+    """
+    lengths = [[length for length in one if length != 1] for one in (array.shape, shape)]
+    if array.size != math.prod(shape) or (lengths[0] != lengths[1] and min(map(len, lengths)) > 1):
+        raise ValueError(f"the observation has the shape {array.shape}, and its space {shape}")
+    return array.reshape(shape)
+
+
+def _has_values_of(array: NDArray[np.generic], observation: Any) -> bool:
+    """Return whether a converted observation has its values, except for the rounding of floats to fewer bits."""
+    found = np.asarray(observation)
+    is_exact = np.can_cast(found.dtype, array.dtype) or found.dtype.kind == array.dtype.kind == "f"
+    return is_exact or np.array_equal(found.ravel(), array.ravel())
 
 
 def has_nan(observation: object) -> bool:

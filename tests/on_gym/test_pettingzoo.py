@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from crashhunt.base.foreign_code import ForeignError
-from crashhunt.errors import ScenarioError
+from crashhunt.errors import ScenarioError, UnusableValueError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.scenario import AgentSetup, Scenario
@@ -128,6 +128,22 @@ def test_others_act_by_the_policy_that_the_scenario_names(tmp_path):
     _, log = drive(simulator_of(tmp_path, learner="hunter_0", others=f"{__name__}:to_the_right"), steps=3)
     assert [actions["runner"] for actions in log] == [2] * len(log)
     assert log[0]["hunter_1"] == 0
+
+
+def out_of_range(name, observation, action_space, generator):
+    return 7 if name == "hunter_0" else np.float64(1)
+
+
+def test_action_of_another_player_outside_its_space_names_the_player(tmp_path):
+    simulator = simulator_of(tmp_path, learner="hunter_1", others=f"{__name__}:out_of_range")
+    with pytest.raises(ForeignError) as caught:
+        drive(simulator)
+    says = "for 'runner': the action np.float64(1.0)", "for 'hunter_0': the action 7"
+    assert isinstance(caught.value.error, UnusableValueError)
+    assert str(caught.value.error) in {
+        f"gym.others = '{__name__}:out_of_range' returned {one} is not in Discrete(3); return an action in this space"
+        for one in says
+    }
 
 
 def test_masked_actions_are_not_drawn(tmp_path):

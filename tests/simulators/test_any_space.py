@@ -16,6 +16,7 @@ from conftest import examples
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from crashhunt.base.foreign_code import ForeignError
 from crashhunt.episode import run_episode
 from crashhunt.errors import ActionError
 from crashhunt.gym import GymSimulator
@@ -358,8 +359,50 @@ def test_observation_that_its_space_cannot_hold_is_not_recorded_as_another(side)
     space = spaces.Dict({"side": spaces.Discrete(2), "x": spaces.Box(-1, 1, (1,))})
     form = ObservationForm(space)
     assert form.encode({"side": 1, "x": np.array([7.0])}).tolist() == [0.0, 1.0, 7.0]  # outside, but recorded as it is
-    with pytest.raises(Exception, match="the environment failed"):
+    with pytest.raises(ForeignError) as caught:
         form.encode({"side": side, "x": np.zeros(1)})
+    assert str(caught.value.error).startswith("observation['side'] does not have the form of Discrete(2): it is ")
+
+
+@pytest.mark.parametrize(
+    ("part", "place", "what"),
+    [
+        ({"image": np.zeros((1, 3), np.uint8)}, "['image']", "array([[0, 0, 0]], dtype=uint8), of shape (1, 3)"),
+        ({}, "['image']", "absent"),
+        (None, "", "None"),
+    ],
+)
+def test_wrong_part_of_an_observation_is_named(part, place, what):
+    """Gymnasium's error named the shape of another part."""
+    space = spaces.Box(0, 255, (2, 2), np.uint8)
+    image = spaces.Dict({"image": space})
+    form = ObservationForm(spaces.Dict({"a": spaces.Tuple((spaces.Discrete(2), image)), "b": spaces.Discrete(2)}))
+    with pytest.raises(ForeignError) as caught:
+        form.encode({"a": (1, part), "b": 1})
+    form_of = space if place else image
+    assert str(caught.value.error) == f"observation['a'][1]{place} does not have the form of {form_of}: it is {what}"
+    assert form.misfit({"a": (1, {"image": np.full((2, 2), 7, np.uint8)}), "b": 2}) == "['b']"
+
+
+def test_axes_of_an_observation_are_not_exchanged():
+    """An image of height, width and channels was shown as one of channels, height and width."""
+    form = ObservationForm(spaces.Box(-9, 9, (3, 4, 5)))
+    assert np.array_equal(form.encode(np.arange(60.0)).ravel(), np.arange(60))
+    for shape, other in (((3,), (1, 3)), ((1,), ()), ((2, 3), (6,))):
+        assert ObservationForm(spaces.Box(-1, 1, shape)).encode(np.zeros(other)).shape == shape
+    for shape in ((4, 5, 3), (12, 5), (59,)):
+        with pytest.raises(ForeignError) as caught:
+            form.encode(np.zeros(shape))
+        assert str(caught.value.error) == f"the observation has the shape {shape}, and its space (3, 4, 5)"
+
+
+@pytest.mark.parametrize(("value", "fits"), [([0.5], False), ([300], False), ([7.0], True), (np.array([7]), True)])
+def test_observation_that_another_type_would_change_lies_outside_the_space(value, fits):
+    form = ObservationForm(spaces.Box(0, 255, (1,), np.uint8))
+    array = form.encode(np.array(value))
+    assert form.contains(np.array(value), array) is fits
+    plain = ObservationForm(spaces.Box(0, 1, (1,), np.float32))
+    assert plain.contains(np.array([0.1]), plain.encode(np.array([0.1])))  # only rounded
 
 
 @pytest.mark.parametrize(("high", "is_flat"), [(2**24, True), (2**62, False)])
