@@ -246,8 +246,10 @@ def test_hunts_in_rare_mode_are_not_paired(tmp_path):
 
 
 def test_trials_of_another_length_are_no_fair_comparison(tmp_path):
-    (pair,) = crashhunt.compare(hunt(tmp_path / "a", 9), hunt(tmp_path / "b", 2, max_steps=5)).pairs
-    assert "9 steps to crash in, those of the other 5" in pair.caution
+    first, same, other = hunt(tmp_path / "a", 9), tmp_path / "b", tmp_path / "c"
+    found = crashhunt.compare(first, hunt(same, 2, max_steps=5), hunt(other, 2, seed=2, max_steps=5))
+    assert [pair.test for pair in found.pairs][1:] == ["intervals"]
+    assert all("9 steps to crash in, those of the other 5" in pair.caution for pair in found.pairs)
 
 
 def test_of_a_hunt_that_guided_its_trials_only_those_count_that_it_did_not(tmp_path):
