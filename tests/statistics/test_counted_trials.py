@@ -21,7 +21,6 @@ from crashhunt.statistics._counted_trials import (
     facts_of,
     facts_of_plain,
 )
-from crashhunt.statistics._rate_of_running_hunt import Paced
 from crashhunt.statistics._rate_report import make_rate
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, TrialSpec
 
