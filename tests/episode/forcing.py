@@ -1,13 +1,10 @@
-"""Run by test_forced_onsets.py in a process that has one thread: roots with copies, and what becomes of them."""
+"""Roots with copies, and what becomes of them, for test_forced_onsets.py in a process that has one thread."""
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 from branching import Place, Sleeps
 
@@ -85,14 +82,9 @@ def lost(stage):
     return found
 
 
-if __name__ == "__main__":
-    what, stage = sys.argv[1], Path(sys.argv[2])
-    asked = {
-        "lost": lambda: lost(stage),
-        "toy": lambda: roots("toy", stage, 9.5, 2, 120),
-        "loop": lambda: roots("loop", stage, 15.0, 7, 150),
-        "merge": lambda: roots("merge", stage, 15.0, 7, 150, ("cut_in=0.05", "late_merge=0.05", "speed=0.05")),
-    }
-    print(json.dumps(asked[what]()))
-    sys.stdout.flush()
-    os._exit(0)
+ANSWERS = {
+    "lost": lost,
+    "toy": lambda stage: roots("toy", stage, 9.5, 2, 120),
+    "loop": lambda stage: roots("loop", stage, 15.0, 7, 150),
+    "merge": lambda stage: roots("merge", stage, 15.0, 7, 150, ("cut_in=0.05", "late_merge=0.05", "speed=0.05")),
+}

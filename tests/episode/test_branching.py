@@ -9,7 +9,7 @@ from single_threaded import answer_of, wait_for_the_end_of
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-    return lambda what: answer_of("branching.py", what, tmp_path)
+    return lambda what: answer_of("branching", what, tmp_path)
 
 
 @pytest.mark.parametrize("scenario", ["toy", pytest.param("loop", marks=pytest.mark.nightly)])

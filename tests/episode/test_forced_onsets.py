@@ -15,7 +15,7 @@ from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-    return lambda what: answer_of("forcing.py", what, tmp_path)
+    return lambda what: answer_of("forcing", what, tmp_path)
 
 
 NIGHTLY = [pytest.param(name, marks=pytest.mark.nightly) for name in ("loop", "merge")]

@@ -19,7 +19,7 @@ class Words(str):
 @pytest.fixture
 def ask(tmp_path):
     """Asks a process of one thread."""
-    return lambda what: answer_of("forking.py", what, tmp_path)
+    return lambda what: answer_of("forking", what, tmp_path)
 
 
 @pytest.mark.parametrize(
