@@ -100,7 +100,7 @@ _TESTS_ELSEWHERE = {
     "cli/_report.py": ("report/test_page.py",),
     "cli/_run.py": ("e2e/test_run_help.py", "e2e/test_commands.py", "e2e/test_stops.py"),
     "cli/_show.py": ("cli/test_answers_on_crashes.py",),
-    "cli/_shrink.py": ("e2e/test_shrink.py",),
+    "cli/_shrink.py": ("cli/test_answers_on_crashes.py",),
     "cli/_split.py": (
         "cli/test_answers.py",
         "training/test_held_out_traffics.py",
@@ -182,7 +182,7 @@ _TESTS_ELSEWHERE = {
     "plans/_arguments.py": ("agents/test_programs.py", "plans/test_argument_names.py"),
     "replays/_debugger.py": ("e2e/test_debugger.py",),
     "replays/_prepare.py": ("e2e/test_foreign_hunts.py", "e2e/test_replay.py"),
-    "replays/_replaying.py": ("replays/test_killed_replays.py", "e2e/test_replay.py"),
+    "replays/_replaying.py": ("e2e/test_replay.py",),
     # Tests of simulators lie by what a user does; these are the ones that drive on the simulator of the module.
     "simulators/_any_space.py": ("simulators/test_actions.py", "on_gym/test_gym.py"),
     "simulators/_kinematics_observation.py": (

@@ -93,6 +93,11 @@ def change(bundle, *, honest=True, **values):
     file.write_text(json.dumps(data))
 
 
+def test_reason_for_an_unknown_last_step_is_written_and_read(bundle):
+    dataclasses.replace(bundle, result=dataclasses.replace(bundle.result, escape=None, why_no_escape="killed")).write()
+    assert (read_bundle(bundle.path).result.escape, read_bundle(bundle.path).result.why_no_escape) == (None, "killed")
+
+
 def test_what_is_written_is_read(tmp_path):
     bundle = made(tmp_path)
     assert bundle.path == tmp_path / "crashes" / "000012-collision"

@@ -60,64 +60,6 @@ def test_a_full_disk_is_reported_and_what_came_of_the_trials_is_remembered(hunt,
     assert not list(folder.glob(".*"))
 
 
-BAD = """
-import os
-
-class Dies:
-    def __init__(self, speed: float = 12.0):
-        self.speed = speed
-
-    def reset(self, seed):
-        self.steps = 0
-
-    def act(self, observation):
-        self.steps += 1
-        if self.steps > 20 and self.speed > 5:
-            os._exit(7)
-        return self.speed, 0
-
-class Flaky(Dies):
-    def act(self, observation):
-        self.steps += 1
-        if self.steps == 6 and os.urandom(1)[0] < 160:
-            raise ValueError("now and then")
-        return min(self.speed, 6.0), 0
-"""
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("agent", "words", "confirmed"), [("Dies", (), True), ("Dies", ("--no-snapshot",), True), ("Flaky", (), None)]
-)
-def test_a_dead_process_a_flaky_crash_and_one_without_a_snapshot_become_smaller(toy, agent, words, confirmed):
-    (toy.folder / "bad.py").write_text(BAD, encoding="utf-8")
-    given = ("--scenario", "toy", "--agent", f"bad:{agent}", "--arg", "speed=6.1234:14", "--seed", "1", *words)
-    toy.crashhunt("run", "h", "1", "30", "60", *given)
-    told = toy.crashhunt("shrink", "h", "--json", expect=None).json
-    if confirmed is None and told["verdict"] == "not_reproduced":  # by chance, three or ten times
-        assert "did not come again" in told["why"]
-        return
-    assert told["verdict"] == "shrunk"
-    small = find_bundle(toy.folder / "h", f"{told['crash']}.small")
-    assert small.result.outcome is find_bundle(toy.folder / "h").result.outcome
-    if confirmed is not None:
-        assert told["confirmed"] is confirmed
-        assert toy.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-    assert any("--no-snapshot" in note for note in told["notes"]) is bool(words)
-
-
-@pytest.mark.nightly
-def test_of_several_agents_one_is_left_in_traffic(shell):
-    words = ("--scenario", "loop-two-agents", "--seed", "1", "--keep-going")
-    shell.crashhunt("run", "h", "2", "10", "600", *words)
-    told = shell.crashhunt("shrink", "h", "--json").json
-    small = find_bundle(shell.folder / "h", f"{told['crash']}.small")
-    assert (told["confirmed"], told["actors_after"] <= 3) == (True, True)
-    assert list(small.result.spec.arguments) == [path.actor.id for path in small.result.spec.script.agents]
-    assert len(small.result.spec.arguments) == 1
-    assert shell.crashhunt("replay", "h", "--crash", small.id, "--json").json["verdict"] == "reproduced"
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("parallel", ["1", "3"])
 def test_others_are_excluded_on_sumo(shell, parallel, tmp_path_factory):

@@ -70,6 +70,12 @@ def test_sentences_have_the_distances_speeds_and_times_of_the_crash(rear_end):
     assert words[5].startswith("At fault: ego, by the rule 'rear end': ")
 
 
+def test_reason_for_an_unknown_last_step_is_a_sentence(rear_end):
+    result = replace(rear_end.result, escape=None, why_no_escape="the search was killed")
+    said = "The last step at which braking would have helped is unknown: the search was killed."
+    assert said in Story(replace(rear_end, result=result)).words()
+
+
 def test_player_of_the_report_has_the_clock_of_the_recording(rear_end):
     story = Story(rear_end)
     data = _crash(rear_end, story)
