@@ -19,7 +19,7 @@ def collect(shell):
     """Collect the violations of two requirements, in ``h``; for `made_once`."""
     words = ["--require", CALM, "--require", "apart=always (clearance_m > 6)", "--oracle", "none", "--keep-going"]
     words += ["--keep", "1"]
-    hunt(shell, *words)
+    hunt(shell, *words, trials="3")
 
 
 def test_violations_are_crashes_of_one_type_per_requirement(toy, made_once):
