@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import sqlite3
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
@@ -413,11 +412,9 @@ class LedgerReader:
         return float(row[8]) if row and self._plain(row) else None
 
     def _select(self, query: str, values: Row = ()) -> Iterator[Row]:
-        try:
+        with explained(self._path):  # also in the middle of a file that is damaged
             for row in self._database.execute(query, values):  # noqa: UP028 - it would close the cursor, maybe too late
                 yield row
-        except sqlite3.Error as error:  # also in the middle of a file that is damaged
-            raise explained(self._path, error) from error
 
     def _row(self, number: int) -> Row | None:
         return next(self._select(f"{self._shape.select('trials')} WHERE number = ?", (number,)), None)
@@ -489,12 +486,10 @@ class LedgerReader:
         return int(next(self._select("SELECT coalesce(sum(other_steps), 0) FROM trials"))[0])
 
     def _chunks(self, query: str = _BY_TIME) -> Iterator[list[Row]]:
-        try:
+        with explained(self._path):
             cursor = self._database.execute(query)
             while rows := cursor.fetchmany(_CHUNK_ROWS):
                 yield rows
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
 
 
 def _among(column: str, values: Sequence[str]) -> str:

@@ -215,8 +215,16 @@ def damaged(path: Path, message: str) -> HuntDirectoryError:
     return HuntDirectoryError(f"the ledger is damaged: {message}", fix=fix, where=str(path))
 
 
-def explained(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
-    """Convert an error of SQLite to an error of crashhunt."""
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Return a context in which an error of SQLite becomes an error of crashhunt."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise _explanation(path, error) from error
+
+
+def _explanation(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
     where, text = str(path), " ".join(str(error).split())  # which may quote what is damaged
     # SQLite reports a file that would exceed ``ulimit -f`` as an I/O error.
     if "disk I/O" in text and (limit := limit_behind(OSError(errno.EFBIG, text))):
@@ -355,12 +363,10 @@ def rewrite(database: sqlite3.Connection, path: Path) -> None:
         HuntDirectoryError: the folder was removed or is not writable.
     """
     try:
-        with whole_file(path) as temporary:
+        with explained(path), whole_file(path) as temporary:
             with closing(sqlite3.connect(temporary)) as copy:
                 database.backup(copy)
             database.close()  # which removes what belongs to the old file
-    except sqlite3.Error as error:
-        raise explained(path, error) from error
     except OSError as error:
         message = f"the ledger was removed while the hunt ran, and cannot be written again: {error.strerror}"
         fix = "run the hunt again, in a directory that no other process writes to"

@@ -81,7 +81,7 @@ class Ledger(LedgerReader):
                 f"{str(path.parent)!r} is not the directory of a hunt: it has no ledger.sqlite",
                 fix="give the directory of a hunt",
             )
-        try:
+        with explained(path):
             if writable and not has_begun(path):
                 create(path)
             may_write = os.access(path.parent, os.W_OK)  # not on a read-only file system, or in another user's folder
@@ -93,8 +93,6 @@ class Ledger(LedgerReader):
                 if writable:
                     self._begin_to_write()
                 failed.pop_all()
-        except sqlite3.Error as error:
-            raise explained(path, error) from error
 
     def wait_while_locked(self, wait: Callable[[float], None]) -> None:
         """Wait without a limit from now on while another process, such as a backup, locks the file.
@@ -140,7 +138,7 @@ class Ledger(LedgerReader):
         Raises:
             HuntDirectoryError: the disk is full.
         """
-        try:
+        with explained(self._path):
             self._database.execute("BEGIN")  # which locks nothing until the first of them
             self._together_since = time.monotonic()
             try:
@@ -149,8 +147,6 @@ class Ledger(LedgerReader):
                 self._together_since = math.inf
                 if self._database.in_transaction:  # which an error of the disk may have ended
                     self._database.execute("COMMIT")
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
 
     def copy(self, row: Row) -> None:
         """Add a row that `intact_rows` of another ledger has yielded, without the columns of a later version."""
@@ -165,16 +161,12 @@ class Ledger(LedgerReader):
         Raises:
             HuntDirectoryError: the disk is full, or a trial was proposed twice.
         """
-        try:
-            with self._database:
-                self._database.execute("BEGIN")
-                for turn in turns:
-                    self._turns += 1
-                    row = (self._turns, turn.spec.number, json.dumps(turn.told), json.dumps(turn.spec.to_json()))
-                    values = (*row, digest_of_row(row))
-                    self._database.execute("INSERT INTO proposals VALUES (?, ?, ?, ?, ?)", values)
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
+        with explained(self._path), self._database:
+            self._database.execute("BEGIN")
+            for turn in turns:
+                self._turns += 1
+                row = (self._turns, turn.spec.number, json.dumps(turn.told), json.dumps(turn.spec.to_json()))
+                self._database.execute("INSERT INTO proposals VALUES (?, ?, ?, ?, ?)", (*row, digest_of_row(row)))
 
     def note(self, **facts: Unpack[Facts]) -> None:
         """Set facts about the hunt as a whole, such as its state; the value None removes a fact.
@@ -182,12 +174,9 @@ class Ledger(LedgerReader):
         After the method has returned, all earlier records are on the disk and survive a power failure. This method is
         called about once a second. A call after every trial would cost more than the trials.
         """
-        try:
-            with self._lasting():
-                for key, value in facts.items():
-                    self._note(key, value)
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
+        with self._lasting():
+            for key, value in facts.items():
+                self._note(key, value)
 
     def enter(self, state: str, detail: str = "", **facts: Unpack[Noted]) -> None:
         """Set the state of the hunt, and record the time and the reason."""
@@ -200,27 +189,21 @@ class Ledger(LedgerReader):
 
     def _event(self, state: str, detail: str) -> None:
         event = (time.time(), state, detail)
-        try:
-            with self._lasting():
-                self._database.execute("INSERT INTO events VALUES (?, ?, ?, ?)", (*event, digest_of_row(event)))
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
+        with self._lasting():
+            self._database.execute("INSERT INTO events VALUES (?, ?, ?, ?)", (*event, digest_of_row(event)))
 
     def replace(self, numbers: Iterable[int]) -> int:
         """Remove trials from the results so that they run again, and return the number of removed trials."""
         gone = 0
-        try:
-            with self._database:
-                self._database.execute("BEGIN")
-                for number in numbers:
-                    found = self.result_text(number)
-                    if found is not None:
-                        row = (number, time.time(), found)
-                        self._database.execute("INSERT INTO replaced VALUES (?, ?, ?, ?)", (*row, digest_of_row(row)))
-                        self._database.execute("DELETE FROM trials WHERE number = ?", (number,))
-                        gone += 1
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
+        with explained(self._path), self._database:
+            self._database.execute("BEGIN")
+            for number in numbers:
+                found = self.result_text(number)
+                if found is not None:
+                    row = (number, time.time(), found)
+                    self._database.execute("INSERT INTO replaced VALUES (?, ?, ?, ?)", (*row, digest_of_row(row)))
+                    self._database.execute("DELETE FROM trials WHERE number = ?", (number,))
+                    gone += 1
         return gone
 
     def restore(self) -> bool:
@@ -249,15 +232,12 @@ class Ledger(LedgerReader):
         self._database.close()
 
     def _insert(self, row: Row) -> None:
-        values = (*row, digest_of_row(row))
-        try:
-            self._database.execute(_INSERT, values)
+        with explained(self._path):
+            self._database.execute(_INSERT, (*row, digest_of_row(row)))
             if time.monotonic() - self._together_since > _TOGETHER_S:
                 self._database.execute("COMMIT")
                 self._database.execute("BEGIN")
                 self._together_since = time.monotonic()
-        except sqlite3.Error as error:
-            raise explained(self._path, error) from error
 
     def _note(self, key: str, value: object) -> None:
         if value is None:
@@ -272,19 +252,20 @@ class Ledger(LedgerReader):
 
         Inside `together`, its records are committed first, because SQLite refuses a transaction within a transaction.
         """
-        is_together = self._database.in_transaction
-        if is_together:
-            self._database.execute("COMMIT")
-        self._database.execute("PRAGMA synchronous = FULL")
-        try:
-            with self._database:
-                self._database.execute("BEGIN")
-                yield
-        finally:
-            self._database.execute("PRAGMA synchronous = NORMAL")
+        with explained(self._path):
+            is_together = self._database.in_transaction
             if is_together:
-                self._database.execute("BEGIN")
-                self._together_since = time.monotonic()
+                self._database.execute("COMMIT")
+            self._database.execute("PRAGMA synchronous = FULL")
+            try:
+                with self._database:
+                    self._database.execute("BEGIN")
+                    yield
+            finally:
+                self._database.execute("PRAGMA synchronous = NORMAL")
+                if is_together:
+                    self._database.execute("BEGIN")
+                    self._together_since = time.monotonic()
 
     def _begin_to_write(self) -> None:
         """Check that the existing contents are intact before the first write.

@@ -406,7 +406,7 @@ def test_ledger_of_later_without_a_word_on_readers_is_refused(path):
 )
 def test_error_of_sqlite_has_a_cause_and_a_fix(path, monkeypatch, text, says, fix):
     monkeypatch.setattr(resource, "getrlimit", lambda which: (resource.RLIM_INFINITY,) * 2)
-    found = _schema.explained(path, sqlite3.OperationalError(text))
+    found = _schema._explanation(path, sqlite3.OperationalError(text))
     assert says in str(found)
     assert fix in found.fix
     assert found.where == str(path)
@@ -416,7 +416,7 @@ def test_limit_on_the_size_of_files_is_not_taken_for_a_full_disk(path, monkeypat
     monkeypatch.setattr(
         resource, "getrlimit", lambda which: (1 << 20, 1 << 20) if which == resource.RLIMIT_FSIZE else ()
     )
-    found = _schema.explained(path, sqlite3.OperationalError("disk I/O error"))
+    found = _schema._explanation(path, sqlite3.OperationalError("disk I/O error"))
     assert "cannot be written (disk I/O error), because the limit on the size of a file is 1 MiB" in found.message
     assert found.fix == "raise it with ulimit -f"
 
@@ -424,7 +424,7 @@ def test_limit_on_the_size_of_files_is_not_taken_for_a_full_disk(path, monkeypat
 def test_limit_on_open_files_is_not_taken_for_a_folder_that_is_not_writable(path, monkeypatch):
     monkeypatch.setattr(_schema, "error_of_next_files", lambda count: OSError(errno.EMFILE, "Too many open files"))
     monkeypatch.setattr(resource, "getrlimit", lambda which: (7, 7))
-    found = _schema.explained(path, sqlite3.OperationalError("unable to open database file"))
+    found = _schema._explanation(path, sqlite3.OperationalError("unable to open database file"))
     assert found.message == "cannot be opened (Too many open files)"
     assert found.fix == "the limit on open files is 7: raise it with ulimit -n"
 
@@ -433,7 +433,7 @@ def test_file_that_cannot_be_opened_is_a_folder_or_forbidden_or_has_no_folder(pa
     error = sqlite3.OperationalError("unable to open database file")
 
     def explained():
-        return str(_schema.explained(path, error))
+        return str(_schema._explanation(path, error))
 
     path.write_text("x")
     assert "is not writable" in explained()
