@@ -157,6 +157,10 @@ def import_environment(folder: Path, tree: Path) -> dict[str, str]:
     return {**_environment_of_git(), "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
+ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
+"""A program for another Python, which prints the file of the module that it is given, and does not import it."""
+
+
 def run_to_end(
     command: Sequence[str], folder: Path | None, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:

@@ -15,6 +15,7 @@ from crashhunt.base.agent_locators import is_program
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import (
+    ORIGIN_SCRIPT,
     BuildError,
     checked_out,
     clean_tree,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 _BISECT_WORDS: dict[Got, str] = {"still": "bad", "fixed": "good", "changed": "skip", "cannot_run": "skip"}
 _FIRST_BAD_COMMIT = re.compile(r"^([0-9a-f]{7,64}) is the first \S+ commit", re.MULTILINE)
-_ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,7 @@ def _run(case: Path, folder: Path, tree: Path, modules: set[str]) -> tuple[Got, 
     """Run a case with the code of a work tree, in a new process; return its status, and why it cannot run."""
     environment = import_environment(folder, tree)
     for module in sorted(modules):
-        place = [sys.executable, "-P", "-c", _ORIGIN_SCRIPT, module]
+        place = [sys.executable, "-P", "-c", ORIGIN_SCRIPT, module]
         found = run_to_end(place, folder, environment)
         origin = found.stdout.strip()
         if found.returncode == 0 and not Path(origin).resolve().is_relative_to(tree):

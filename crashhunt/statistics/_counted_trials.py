@@ -28,8 +28,6 @@ from crashhunt.trial import KILLED, Failure, Outcome
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from crashhunt.trial import TrialResult
-
 Per: TypeAlias = RatePer
 """What a rate is per."""
 
@@ -65,22 +63,6 @@ class TrialFacts(NamedTuple):
 
 Unit: TypeAlias = tuple[TrialFacts, ...]
 """The valid trials of a unit: one, or all of a traffic."""
-
-
-def facts_of(result: TrialResult, crash_on: Sequence[str]) -> TrialFacts:
-    """Return the facts about a trial that a rate needs, from its result."""
-    return TrialFacts(
-        number=result.spec.number,
-        has_ended=not result.was_killed_from_outside,
-        valid=result.outcome is not Outcome.INVALID,
-        crashed=result.outcome in crash_on,
-        steps=result.steps,
-        driven_s=result.driven_s,
-        driven_m=result.driven_m,
-        step_length_s=result.step_length_s,
-        origin=result.spec.origin,
-        seed=result.spec.seed,
-    )
 
 
 def facts_of_plain(data: Mapping[str, Any], crash_on: Sequence[str], tags: tuple[str, ...] = ()) -> TrialFacts:

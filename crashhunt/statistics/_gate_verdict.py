@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from crashhunt.statistics._paired_test import PairTest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from crashhunt.statistics._counted_pairs import Pair
-
 
 PairVerdict = Literal["better", "worse", "no_difference", "undecided"]
 """The verdict of pairs on the second agent, compared with the first."""
@@ -33,19 +27,11 @@ class PairWatch:
         self.test = PairTest()
         self.verdict: PairVerdict = "undecided"
 
-    def add(self, pairs: Sequence[Pair] | Iterator[Pair], *, may_end: bool = True) -> None:
-        """Add pairs in their order until a pair decides.
+    def decide(self, *, may_end: bool = True) -> PairVerdict:
+        """Return the verdict on the pairs that were added to the test; the first verdict is final.
 
         Unless it ``may_end``, the verdicts *better* and *no difference* are not allowed yet; *worse* is always allowed.
         """
-        for pair in pairs:
-            if self.verdict != "undecided":
-                return
-            self.test.add(pair)
-            self.decide(may_end=may_end)
-
-    def decide(self, *, may_end: bool = True) -> PairVerdict:
-        """Return the verdict on the pairs that were added; the first verdict is final."""
         if self.verdict == "undecided":
             worse = self.test.verdict(self.alpha)
             if worse == "second" or (worse and may_end):

@@ -22,7 +22,6 @@ from crashhunt.statistics._counted_trials import (
     RateCounter,
     TrialFacts,
     UnitSequence,
-    facts_of,
     facts_of_plain,
 )
 from crashhunt.statistics._rare import BLOCK, TRIALS_PER_ROOT, RareCounter, is_root, learn_forcing, root_of, with_plain
@@ -68,8 +67,8 @@ class RateWatch:
 
     def add(self, result: TrialResult | Mapping[str, Any]) -> None:
         """Add a finished trial, as a result or as data from a ledger; the order of trials does not matter."""
-        make = facts_of_plain if isinstance(result, dict) else facts_of
-        self.add_facts(make(result, self._crash_on))  # type: ignore[arg-type]
+        data = result if isinstance(result, dict) else result.to_json()  # type: ignore[union-attr]
+        self.add_facts(facts_of_plain(data, self._crash_on))
 
     def add_facts(self, trial: TrialFacts) -> None:
         """Add the facts of a finished trial."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from crashhunt.base.agent_locators import is_program
 from crashhunt.base.errors import CrashhuntError, UsageError
 from crashhunt.base.git import (
+    ORIGIN_SCRIPT,
     checked_out,
     commit_of,
     copy_built,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 _BUILT: Final = "built"
 """The files that --build has made for each version, in the folder of a kept gate."""
-_ORIGIN_SCRIPT = "import importlib.util, sys; print(importlib.util.find_spec(sys.argv[1]).origin)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,5 +140,5 @@ class WorkTrees:
 
 def _origin_of(module: str, folder: Path, environment: Mapping[str, str]) -> Path:
     """Return the file from which a module is imported in a work tree; the tree's folder if it cannot be found."""
-    done = run_to_end([sys.executable, "-P", "-c", _ORIGIN_SCRIPT, module], folder, environment)
+    done = run_to_end([sys.executable, "-P", "-c", ORIGIN_SCRIPT, module], folder, environment)
     return Path(done.stdout.strip()).resolve() if done.returncode == 0 else folder

@@ -18,7 +18,6 @@ from crashhunt.statistics._counted_trials import (
     MAX_INVALID_SHARE,
     RateCounter,
     UnitSequence,
-    facts_of,
     facts_of_plain,
 )
 from crashhunt.statistics._rate_report import make_rate
@@ -83,7 +82,6 @@ def test_facts_of_a_result_are_those_of_its_row(outcome, failure, has_ended, val
     spec = TrialSpec(7, 5, {}, {}, 99, origin="random")
     result = TrialResult(spec, outcome, steps=42, failure=failure, driven_s=4.2, driven_m=50.0, step_length_s=0.1)
     expected = TrialFacts(7, has_ended, valid, crashed, 42, 4.2, 50.0, 0.1, "random", seed=5)
-    assert facts_of(result, ("collision",)) == expected
     row = facts_of_plain(result.to_json(), ("collision",), ("part",))
     assert row == expected._replace(tags=("part",), failure=failure)
     assert facts_of_plain({"spec": {"number": 7, "seed": 5}, "outcome": "collision", "steps": 42}, ()) == TrialFacts(

@@ -68,6 +68,14 @@ def counted(only_first, only_second, alike):
     return test
 
 
+def watch_pairs(watch, pairs, *, may_end=True):
+    """Add pairs to a watch until one decides, as a gate does."""
+    for pair in pairs:
+        if watch.verdict == "undecided":
+            watch.test.add(pair)
+            watch.decide(may_end=may_end)
+
+
 def test_interval_of_the_difference_is_symmetric_and_shrinks_with_pairs():
     for counts in ((0, 0, 100), (3, 9, 500), (40, 10, 1950)):
         low, high = counted(*counts).difference()
@@ -130,7 +138,7 @@ def test_interval_seldom_ever_excludes_the_true_difference(rates):
 def watched(rng, base, head, pairs, margin=0.0):
     watch = PairWatch(margin)
     for number, (first, second) in enumerate(zip(rng.random(pairs) < base, rng.random(pairs) < head, strict=True)):
-        watch.add([((trial(number, crashed=bool(first)), trial(number, crashed=bool(second))),)])
+        watch_pairs(watch, [((trial(number, crashed=bool(first)), trial(number, crashed=bool(second))),)])
         if watch.verdict != "undecided":
             break
     return watch
@@ -147,20 +155,20 @@ def test_different_agents_get_a_verdict_and_equal_ones_seldom_do():
 def test_verdict_stays_and_later_pairs_do_not_count():
     worse = [((trial(n), trial(n, crashed=True)),) for n in range(40)]
     watch = PairWatch(0.01)
-    watch.add(worse)
+    watch_pairs(watch, worse)
     assert (watch.verdict, watch.test.pairs) == ("worse", 8)  # 1 / evidence of 8 heads is below 5 %, of 7 it is not
     better = [(both[::-1],) for (both,) in worse]
-    watch.add(better)
+    watch_pairs(watch, better)
     assert (watch.verdict, watch.test.pairs) == ("worse", 8)
     watch = PairWatch(0.01)
-    watch.add(better, may_end=False)
+    watch_pairs(watch, better, may_end=False)
     assert (watch.verdict, watch.test.pairs) == ("undecided", 40)
     assert watch.decide() == "better"
 
 
 def test_equal_crashes_in_all_pairs_are_no_difference_above_the_margin():
     watch = PairWatch(0.02)
-    watch.add([((trial(n, crashed=n % 2 == 0),) * 2,) for n in range(400)])
+    watch_pairs(watch, [((trial(n, crashed=n % 2 == 0),) * 2,) for n in range(400)])
     assert watch.verdict == "no_difference"
     assert watch.test.both > 0
     low, high = watch.test.difference()
@@ -253,9 +261,9 @@ def test_verdict_is_valid_for_every_result_of_trials_without_one(lost):
     assert (test.pairs, test.unknown, test.side(1).lost, test.side(1).not_started) == (12, 12, 12, 0)
     # No agent crashes, but many trials of one have no result: that is not "no difference".
     watch = PairWatch(0.05)
-    watch.add([(both,) for both in zip(*[[trial(n) for n in range(400)]] * 2, strict=True)][:90])
-    watch.add([((trial(n), trial(n, **lost)),) for n in range(90, 110)])
-    watch.add([((trial(n),) * 2,) for n in range(110, 400)])
+    watch_pairs(watch, [(both,) for both in zip(*[[trial(n) for n in range(400)]] * 2, strict=True)][:90])
+    watch_pairs(watch, [((trial(n), trial(n, **lost)),) for n in range(90, 110)])
+    watch_pairs(watch, [((trial(n),) * 2,) for n in range(110, 400)])
     assert watch.verdict == "undecided"
 
 
