@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from exact_values import exact
 from highway_env.road.lane import StraightLane
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
@@ -31,6 +32,13 @@ def two_roads(poses):
     place = Road(network, np_random=np.random.default_rng(1))
     place.vehicles += [IDMVehicle(place, position, 0, speed, timer=timer) for position, speed, timer in poses]
     return place
+
+
+def state(place):
+    """Every attribute of the vehicles and objects of a road, and its generator."""
+    things = [*place.vehicles, *place.objects]
+    found = [(type(thing).__name__, len(vars(thing).get("history", ())), exact(vars(thing))) for thing in things]
+    return found, str(place.np_random.bit_generator.state)
 
 
 def same_either_way(drive):

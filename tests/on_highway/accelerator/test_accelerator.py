@@ -29,6 +29,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
+from small_roads import state
 
 from crashhunt.highway.accelerator import (
     Onlooker,
@@ -79,22 +80,11 @@ CASES += [
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
-def state(env):
-    """Everything that a simulation may change about the vehicles and the generator."""
-    names = "position heading speed action crashed hit impact lane_index target_lane_index target_speed timer route"
-    names += " speed_index is_yielding yield_timer lateral_speed yaw_rate"
-    things = [*env.road.vehicles, *env.road.objects]
-    vehicles = [
-        (type(thing).__name__, [exact(getattr(thing, name, None)) for name in names.split()]) for thing in things
-    ]
-    return vehicles, exact(env.np_random.bit_generator.state)
-
-
 def episode(name, config, seed, steps, *, idm):
     """The whole state after every sub-step, and what every step returns."""
     restore_classes()
     env = gymnasium.make(name, disable_env_checker=True).unwrapped
-    trace = [exact(env.reset(seed=seed, options={"config": config})[0]), state(env)]
+    trace = [exact(env.reset(seed=seed, options={"config": config})[0]), state(env.road)]
     if idm:
         driver = IDMVehicle.create_from(env.vehicle) if isinstance(env.vehicle, ControlledVehicle) else None
         if driver is not None:
@@ -102,7 +92,7 @@ def episode(name, config, seed, steps, *, idm):
             env.controlled_vehicles[0] = driver
             env.action_type.controlled_vehicle = driver
             env.observation_type.observer_vehicle = driver
-    onlooker = Onlooker(env.road.step, after=lambda: trace.append(state(env)))
+    onlooker = Onlooker(env.road.step, after=lambda: trace.append(state(env.road)))
     # Where any other function stands in its place, everybody is looked at again in every sub-step.
     env.road.step = onlooker if idm or seed == 0 else lambda dt: onlooker(dt)
     env.action_space.seed(seed)

@@ -16,32 +16,12 @@ from highway_env.road import regulation, road
 from highway_env.road.lane import StraightLane
 from highway_env.vehicle import behavior, dynamics
 from highway_env.vehicle.controller import ControlledVehicle
-from small_roads import same_either_way, two_roads
+from small_roads import same_either_way, state, two_roads
 
 from crashhunt.highway.accelerator import Onlooker, _roads, _switch, kind_of, switch_on
 
 assert highway_env
-NAMES = "position heading speed action crashed impact lane_index target_lane_index target_speed timer route"
-NAMES += " lateral_speed yaw_rate is_yielding"
-
-
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
-
-
-def state(place):
-    return [
-        [
-            value.tobytes() if isinstance(value := vars(thing).get(name), np.ndarray) else repr(_plain(value))
-            for name in NAMES.split()
-        ]
-        for thing in place.vehicles
-    ]
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {key: float(number) for key, number in value.items()}
-    return float(value) if isinstance(value, float | int | np.number) else value
 
 
 def made(kind=HighwayEnvFast):

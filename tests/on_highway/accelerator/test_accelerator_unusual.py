@@ -12,19 +12,12 @@ from exact_values import exact
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from small_roads import same_either_way, two_roads
+from small_roads import same_either_way, state, two_roads
 
 from crashhunt.highway.accelerator import _roads, switch_on
 
 assert highway_env
-NAMES = ["position", "heading", "speed", "crashed", "impact", "lane_index", "target_lane_index", "timer", "route"]
-
-
 pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
-
-
-def state(place):
-    return [[len(vehicle.history), *(exact(vars(vehicle).get(name)) for name in NAMES)] for vehicle in place.vehicles]
 
 
 def five(count=5):

@@ -24,7 +24,7 @@ from highway_env import utils
 from highway_env.envs.common import observation
 from highway_env.road import lane, regulation, road
 from highway_env.vehicle import behavior, controller, kinematics, objects
-from small_roads import same_either_way
+from small_roads import same_either_way, state
 
 import crashhunt
 from crashhunt.highway import restore_classes
@@ -236,25 +236,6 @@ def change_value(rng, env, changes):
 
 CHANGES = [change_class, change_class, change_module, change_object, change_object, change_subclass, change_subclass,
            change_value, change_value]  # fmt: skip
-STATE = [
-    "position",
-    "heading",
-    "speed",
-    "action",
-    "crashed",
-    "hit",
-    "impact",
-    "lane_index",
-    "target_lane_index",
-    "target_speed",
-    "timer",
-]
-
-
-def state(env):
-    return [
-        [exact(vars(thing).get(name)) for name in STATE] for thing in [*env.road.vehicles, *env.road.objects]
-    ], exact(env.np_random.bit_generator.state)
 
 
 def played(number, *, fast, alone=False):
@@ -289,7 +270,7 @@ def played(number, *, fast, alone=False):
         onlooker = Onlooker(
             env.road.step,
             before=before,
-            after=lambda: trace.append(state(env)),
+            after=lambda: trace.append(state(env.road)),
             interferes=lambda: count in (3, 4) and when == "middle",  # as it is asked before and after
         )
         # Any other function in its place might do anything.
@@ -345,7 +326,7 @@ def driven(make, change=lambda place: None, steps=12):
                     change(place) if not hasattr(change, "patches") else change(place, patch)
                 place.act()
                 place.step(0.2)
-                trace.append([exact([vars(v).get(name) for name in STATE]) for v in place.vehicles])
+                trace.append(state(place))
             return trace
 
     return same_either_way(drive)

@@ -33,7 +33,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle, RoadObject
 from hypothesis import example, given, settings, strategies as st
-from small_roads import same_either_way
+from small_roads import same_either_way, state
 
 from crashhunt.highway import _descriptor as highway
 from crashhunt.highway._descriptor import BACKEND
@@ -234,19 +234,6 @@ def crowded(seed):
         lane = net.get_lane(net.random_lane_index(road.np_random))
         road.objects.append(kind(road, lane.position(float(rng.uniform(0, lane.length)), 0)))
     return road
-
-
-NAMES = (
-    "position", "heading", "speed", "lane_index", "target_lane_index", "target_speed", "timer", "crashed", "hit",
-    "impact", "action", "route", "data", "lateral_speed", "yaw_rate",
-)  # fmt: skip
-
-
-def state(road):
-    things = [*road.vehicles, *road.objects]
-    return [{name: exact(vars(thing)[name]) for name in NAMES if name in vars(thing)} for thing in things], (
-        str(road.np_random.bit_generator.state)
-    )
 
 
 def played(seed, steps=12):
