@@ -182,8 +182,9 @@ def test_copies_get_a_seed_each_and_count_their_own_steps(monkeypatch):
 
 def test_environment_with_parts_passes_the_checker_of_gymnasium_and_names_the_actors():
     env = gymnasium.make(
-        "crashhunt:crashhunt/SUMO-v0", scenario="intersection", observation="ego, actors:rows=4", max_steps=20
-    )
+        "crashhunt:crashhunt/SUMO-v0", scenario="intersection", observation="ego, actors:rows=4", max_steps=20,
+        process=False,
+    )  # fmt: skip
     try:
         check_env(env.unwrapped, skip_render_check=True)
         observation, info = env.reset(seed=3)

@@ -85,7 +85,7 @@ def test_what_cannot_disturb_is_refused():
     with pytest.raises(UsageError, match="disturb needs a limit on the length of an episode"):
         SumoEnv("loop", disturb="brake=1")
     with pytest.raises(UsageError, match="there is no disturbance 'brakes'"):
-        SumoEnv("loop", process=True, disturb="brakes=1", max_steps=5)
+        SumoEnv("loop", process=False, disturb="brakes=1", max_steps=5)
 
 
 def ended(pid):

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings as examples, strategies as st
+from toy_trials import settings_for
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import Parts, WorkerSettings, run_episode
+from crashhunt.episode import Parts, run_episode
 from crashhunt.executors._postmortem import _fault_of, agent_in_stack, check_report
 from crashhunt.executors._protocol import encode_report
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialSpec
 
 SPEC = TrialSpec(3, 7, {"ego": {"speed": 5.0}}, {}, 12)
@@ -24,8 +24,7 @@ SPEC = TrialSpec(3, 7, {"ego": {"speed": 5.0}}, {}, 12)
 def left_behind(tmp_path_factory):
     """Header, records and result of a trial, and the report that goes with them."""
     place = tmp_path_factory.mktemp("trial")
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    parts = Parts(WorkerSettings(scenario=scenario, oracles=("overlap",), crash_on=(), scratch=place))
+    parts = Parts(settings_for(place, oracles=("overlap",), crash_on=()))
     box = BlackBox(place / "box")
     box.begin(pid=41, trial=SPEC.number, started=0.0)
     result = run_episode(

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import harms
 import pytest
 from conftest import mostly_nightly, wait_for
+from toy_trials import settings_for
 
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, Outcome, TrialResult, TrialSpec
+from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -103,10 +102,7 @@ def run(tmp_path, monkeypatch) -> Callable[..., dict[int, TrialResult]]:
         every: int = 1,
     ) -> dict[int, TrialResult]:
         """Run trials that do harm at a moment, each, or so many of them, between two that do none."""
-        scratch = tmp_path / f"scratch-{time.monotonic_ns()}"
-        scratch.mkdir()
-        scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="harms:Agent")})
-        settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=timeout_s)
+        settings = settings_for(tmp_path, "harms:Agent", timeout_s=timeout_s)
         asked = [("", "")]
         for place, pair in enumerate(trials, start=1):
             asked += [pair] if place % every else [pair, ("", "")]

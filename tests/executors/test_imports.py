@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import shutil
-import time
 
 import harms
 import pytest
 from conftest import mostly_nightly
+from toy_trials import results_of, settings_for
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.executors._postmortem import agent_in_stack
 from crashhunt.executors._time_limits import START_UP_S
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, TrialSpec
+from crashhunt.trial import TrialSpec
 
 LIMIT_S = 2.0
+TRIAL = TrialSpec(0, 7, {"ego": {}}, {}, 5)
 KEEPS = ", which keeps 'driver:Agent' from being imported"
 # Code and why the module cannot be imported; empty if it can.
 DOES = {
@@ -44,11 +43,6 @@ ALWAYS = [("time.sleep(1e9)", PoolExecutor), ("os.kill(os.getpid(), signal.SIGKI
           ("raises_bare", PoolExecutor)]  # fmt: skip
 
 
-def completed_until(deadline, executor):
-    while time.monotonic() < deadline:
-        yield from executor.completed(0.2)
-
-
 @pytest.mark.parametrize(
     ("does", "kind"), mostly_nightly([(does, kind) for does in DOES for kind in (PoolExecutor, FreshProcessExecutor)],
                                      always=ALWAYS)
@@ -58,25 +52,14 @@ def test_import_that_does_harm_is_named_in_one_error(tmp_path, monkeypatch, does
     code = f"harms.HARMS[{does!r}][1]()" if does in harms.HARMS else does
     (tmp_path / "driver.py").write_text(f"import os, signal, time\nimport harms\n{code}\nAgent = harms.Agent\n")
     monkeypatch.chdir(tmp_path)
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="driver:Agent")})
     # Imports may take START_UP_S longer than a trial; a negative limit of trials leaves those that hang 2 s.
     timeout_s = LIMIT_S - START_UP_S if DOES[does].startswith("it takes more") else 20.0
-    settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=timeout_s)
-    executor = kind(settings, parallel=1)
-    found, deadline = [], time.monotonic() + 300
-    try:
-        executor.submit(TrialSpec(0, 7, {"ego": {}}, {}, 5))
-        if not DOES[does]:
-            while not found:
-                found += executor.completed(0.2)
-                assert time.monotonic() < deadline
-            return
-        with pytest.raises(CrashhuntError) as caught:
-            found += completed_until(deadline, executor)
-    finally:
-        executor.close()
+    executor = kind(settings_for(tmp_path, "driver:Agent", timeout_s=timeout_s), parallel=1)
+    if not DOES[does]:
+        results_of(executor, [TRIAL])
+        return
+    with pytest.raises(CrashhuntError) as caught:
+        results_of(executor, [TRIAL])
     said = caught.value
     assert DOES[does] in said.message
     if DOES[does].startswith("it"):  # its process hung or ended
@@ -84,7 +67,7 @@ def test_import_that_does_harm_is_named_in_one_error(tmp_path, monkeypatch, does
         assert said.fix.startswith("see what the module does when it is imported")
     else:
         assert said.where.startswith("harms.py, line ")
-    assert (len(str(said).splitlines()), found) == (1, [])
+    assert len(str(said).splitlines()) == 1
 
 
 STACK = """Fatal Python error: Segmentation fault
@@ -109,20 +92,8 @@ def test_import_that_is_killed_once_from_outside_is_repeated(tmp_path, monkeypat
         "Agent = KeepLaneWithSpeed\n"
     )
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scratch").mkdir()
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="driver:Agent")})
-    settings = WorkerSettings(
-        scenario=scenario, oracles=(), crash_on=CRASHES, scratch=tmp_path / "scratch", timeout_s=20.0
-    )
-    executor = FreshProcessExecutor(settings, parallel=1)
-    found, deadline = [], time.monotonic() + 300
-    try:
-        executor.submit(TrialSpec(0, 7, {"ego": {}}, {}, 5))
-        while not found:
-            found += executor.completed(0.2)
-            assert time.monotonic() < deadline
-    finally:
-        executor.close()
+    settings = settings_for(tmp_path, "driver:Agent", timeout_s=20.0)
+    found = results_of(FreshProcessExecutor(settings, parallel=1), [TRIAL])
     assert (tmp_path / "imported").exists()
     assert [result.failure for result in found] == [None]
 

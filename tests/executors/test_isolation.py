@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from toy_trials import results_of, settings_for
 
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import Executor, FreshProcessExecutor, PoolExecutor
 from crashhunt.scenario import argument_values, load_scenario
-from crashhunt.trial import CRASHES, TrialResult, TrialSpec
+from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,21 +67,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[T
 
     def run(module: str, scenario: Scenario, kind: Callable[..., Executor], count: int) -> list[TrialResult]:
         Path("mine.py").write_text(module, encoding="utf-8")
-        scratch = tmp_path / kind.__name__
-        scratch.mkdir()
         chosen = scenario.with_agents(dict.fromkeys(scenario.agents, "mine:Agent"))
-        executor = kind(WorkerSettings(scenario=chosen, oracles=(), crash_on=CRASHES, scratch=scratch), parallel=1)
-        try:
-            for number in range(count):
-                executor.submit(TrialSpec(number, 5, {}, argument_values(scenario), max_steps=3))
-            found: list[TrialResult] = []
-            deadline = time.monotonic() + 300
-            while len(found) < count:
-                assert time.monotonic() < deadline
-                found += executor.completed(0.2)
-        finally:
-            executor.close()
-        return found
+        specs = [TrialSpec(number, 5, {}, argument_values(scenario), max_steps=3) for number in range(count)]
+        return results_of(kind(settings_for(tmp_path, scenario=chosen), parallel=1), specs)
 
     return run
 

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 from conftest import FAULTY
+from toy_trials import settings_for
 
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, KILLED, Outcome, TrialSpec
+from crashhunt.trial import KILLED, Outcome, TrialSpec
 
 STEPS = 60
 
@@ -23,11 +22,7 @@ STEPS = 60
 def settings(tmp_path, monkeypatch):
     shutil.copy(FAULTY, tmp_path)
     monkeypatch.chdir(tmp_path)
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    ego = AgentSetup(agent="faulty:Waits")
-    scenario = Scenario(simulator="toy", folder=tmp_path, agents={"ego": ego})
-    return WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch)
+    return settings_for(tmp_path, "faulty:Waits")
 
 
 def run_and_kill(executor, spec, steps):

@@ -7,17 +7,16 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from toy_trials import results_of, settings_for
 
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import FreshProcessExecutor, PoolExecutor
 from crashhunt.scenario import AgentSetup, Scenario, argument_values, load_scenario
-from crashhunt.trial import CRASHES, TrialResult, TrialSpec
+from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,22 +54,11 @@ def run(tmp_path, monkeypatch) -> Callable[..., list[TrialResult]]:
     def run_trials(
         scenario: Scenario, make: Callable[..., Executor], kinds: list[str], max_steps: int = 4
     ) -> list[TrialResult]:
-        scratch = tmp_path / f"scratch-{time.monotonic_ns()}"
-        scratch.mkdir()
-        settings = WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=scratch, timeout_s=30.0)
         values = argument_values(scenario)
-        found: list[TrialResult] = []
-        executor = make(settings)
-        try:
-            for number, kind in enumerate(kinds):
-                executor.submit(TrialSpec(number, 5, {"ego": {"leaves": kind}}, values, max_steps))
-            deadline = time.monotonic() + 300
-            while len(found) < len(kinds):
-                assert time.monotonic() < deadline, f"only {len(found)} came back"
-                found += executor.completed(0.2)
-        finally:
-            executor.close()
-        return sorted(found, key=lambda result: result.spec.number)
+        specs = [
+            TrialSpec(number, 5, {"ego": {"leaves": kind}}, values, max_steps) for number, kind in enumerate(kinds)
+        ]
+        return results_of(make(settings_for(tmp_path, scenario=scenario, timeout_s=30.0)), specs)
 
     return run_trials
 

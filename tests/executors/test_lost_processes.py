@@ -9,12 +9,11 @@ import time
 
 import pytest
 from conftest import mostly_nightly
+from toy_trials import settings_for
 
 from crashhunt.base.processes import children_of
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor
-from crashhunt.scenario import AgentSetup, Scenario
-from crashhunt.trial import CRASHES, Outcome, TrialSpec
+from crashhunt.trial import Outcome, TrialSpec
 
 DEADLINE_S = 300.0
 
@@ -22,10 +21,7 @@ DEADLINE_S = 300.0
 @pytest.fixture
 def pool(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    ego = AgentSetup(agent="crashhunt.agents:KeepLaneWithSpeed")
-    scenario = Scenario(simulator="toy", folder=tmp_path, agents={"ego": ego})
-    (tmp_path / "scratch").mkdir()
-    found = PoolExecutor(WorkerSettings(scenario=scenario, oracles=(), crash_on=CRASHES, scratch=tmp_path / "scratch"))
+    found = PoolExecutor(settings_for(tmp_path))
     yield found
     found.close()
 

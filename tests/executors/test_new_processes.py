@@ -12,13 +12,12 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from toy_trials import settings_for
 
 from crashhunt.base.errors import CrashhuntError
-from crashhunt.episode import WorkerSettings
 from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _worker_environment
 from crashhunt.executors._fresh import FreshProcessExecutor
 from crashhunt.executors._postmortem import TrialAttempt
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 KILL = -signal.SIGKILL
@@ -34,8 +33,7 @@ def survived(number):
 
 @pytest.fixture
 def settings(tmp_path):
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    return WorkerSettings(scenario=scenario, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
+    return settings_for(tmp_path, crash_on=(), scratch=tmp_path, timeout_s=9.0)
 
 
 @pytest.fixture

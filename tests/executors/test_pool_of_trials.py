@@ -7,20 +7,17 @@ import subprocess
 from types import SimpleNamespace
 
 import pytest
+from toy_trials import settings_for
 
-from crashhunt.episode import WorkerSettings
 from crashhunt.errors import CrashhuntError
 from crashhunt.executors import PoolExecutor, _fork_server_link
 from crashhunt.executors._postmortem import TrialAttempt
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
 @pytest.fixture
 def pool(tmp_path):
-    toy = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    settings = WorkerSettings(scenario=toy, oracles=(), crash_on=(), scratch=tmp_path, timeout_s=9.0)
-    executor = PoolExecutor(settings)
+    executor = PoolExecutor(settings_for(tmp_path, crash_on=(), timeout_s=9.0))
     yield executor
     executor.close()
 

@@ -14,16 +14,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from toy_trials import settings_for
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError
-from crashhunt.episode import Parts, WorkerSettings, run_episode, scratch_of
+from crashhunt.episode import Parts, run_episode, scratch_of
 from crashhunt.executors import _escape_search, _supervisor, _time_limits
 from crashhunt.executors._postmortem import LostTrialError
 from crashhunt.executors._protocol import encode_report
 from crashhunt.executors._supervisor import EndedTrial, Supervisor
 from crashhunt.recording import BlackBox, Recording, read_black_box
-from crashhunt.scenario import AgentSetup, Scenario
+from crashhunt.scenario import AgentSetup
 from crashhunt.trial import CRASHES, Collision, Outcome, TrialResult, TrialSpec
 
 PID = 4321  # of the process of each trial, as its zygote reports it
@@ -95,10 +96,7 @@ class Zygote:
 
 @pytest.fixture
 def settings(tmp_path):
-    scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    return WorkerSettings(scenario=scenario, oracles=("overlap",), crash_on=CRASHES, scratch=scratch, timeout_s=60.0)
+    return settings_for(tmp_path, oracles=("overlap",), timeout_s=60.0)
 
 
 @pytest.fixture

@@ -11,13 +11,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from toy_trials import settings_for
 
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError, RecorderError
-from crashhunt.episode import FirstCopy, WorkerSettings
+from crashhunt.episode import FirstCopy
 from crashhunt.executors import _trial_process
 from crashhunt.executors._trial_process import TrialProcess, notices_of_late_imports
-from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Collision, Failure, Outcome, TrialResult, TrialSpec
 from crashhunt.world import Lane
@@ -52,10 +52,7 @@ def process(tmp_path, monkeypatch):
     """The process of a trial, which has the test's own output and signals; its supports are those of `Simulator`."""
 
     def make(**given):
-        scenario = Scenario(simulator="toy", agents={"ego": AgentSetup(agent="keep-lane")})
-        settings = WorkerSettings(
-            scenario=scenario, oracles=(), crash_on=(Outcome.COLLISION,), scratch=tmp_path, timeout_s=9.0, **given
-        )
+        settings = settings_for(tmp_path, crash_on=(Outcome.COLLISION,), scratch=tmp_path, timeout_s=9.0, **given)
         found = TrialProcess.__new__(TrialProcess)
         found._settings, found._notices, found._reference, found._fork_runners = settings, ["a notice"], None, ()
         found._box, found._pid, found._has_begun, found._shared = None, 0, False, None

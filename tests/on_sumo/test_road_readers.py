@@ -212,7 +212,7 @@ def test_points_of_lanes_lie_on_sumolibs_lanes_at_the_spacing(town):
     along = sumolib.geomhelper.polygonOffsetWithMinimumDistanceToPoint
     points = others = 0
     for number, vehicles in enumerate(town.steps(60)):
-        for vehicle in vehicles if number % 6 == 0 else ():
+        for vehicle in vehicles if number % 12 == 6 else ():
             shown = town.read(vehicle, "lanes")
             lane, (x, y) = libsumo.vehicle.getLaneID(vehicle), libsumo.vehicle.getPosition(vehicle)
             heading = math.radians(90 - libsumo.vehicle.getAngle(vehicle))
@@ -261,7 +261,7 @@ def is_beside(town, lane, own):
 def test_route_points_follow_the_edges_of_the_route(town):
     checked = 0
     for number, vehicles in enumerate(town.steps(60)):
-        for vehicle in vehicles if number % 6 == 0 else ():
+        for vehicle in vehicles if number % 12 == 6 else ():
             if libsumo.vehicle.getLanePosition(vehicle) < LENGTH_M:  # its centre is not on its lane yet
                 continue
             shown = town.read(vehicle, "route")

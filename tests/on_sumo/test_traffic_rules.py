@@ -105,7 +105,7 @@ def by_loops(rule, signals, step_s):
 def test_signals_are_those_of_libsumo_and_rules_those_of_a_loop(scenario, tmp_path):
     verdicts = {name: set() for name in TRAFFIC_RULES}
     compared = 0
-    for seed in range(1, 7):
+    for seed in range(1, 4):
         result, signals, seen, chosen = driven(scenario, seed, 200, tmp_path)
         net = Path(chosen.folder, next(Path(chosen.folder).glob("*.net.xml"))).read_text()
         limits = {lane: float(limit) for lane, limit in re.findall(r'<lane id="([^"]+)".*?speed="([^"]+)"', net)}

@@ -156,14 +156,14 @@ def test_a_video_has_the_pictures_in_it(tmp_path):
 
 def test_a_gif_plays_in_real_time(tmp_path):
     path = tmp_path / "out.gif"
-    assert write_gif(path, [shot(6)], FilmOptions(size=(320, 200), last_step_repeats=0)) == 7
+    assert write_gif(path, [shot(3)], FilmOptions(size=(320, 200), last_step_repeats=0)) == 4
     with Image.open(path) as image:
-        assert image.n_frames == 7
+        assert image.n_frames == 4
         assert image.info["duration"] == 100
         assert image.info["loop"] == 0
     again = FilmOptions(size=(320, 200), last_step_repeats=5)
     with Image.open(path) as image:
-        assert write_gif(path, [shot(6)], again) == image.n_frames  # what repeats the last picture prolongs it
+        assert write_gif(path, [shot(3)], again) == image.n_frames  # what repeats the last picture prolongs it
 
 
 def test_frames_are_files(tmp_path):

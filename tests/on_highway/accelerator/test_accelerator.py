@@ -29,7 +29,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.objects import Landmark
 from hypothesis import given, settings, strategies as st
-from small_roads import state
+from small_roads import small_road, state
 
 from crashhunt.highway.accelerator import (
     Onlooker,
@@ -175,13 +175,6 @@ def test_neighbours_and_lanes_are_those_of_highway_env_wherever_vehicles_are(dat
     assert answers() == expected
     assert played() == run
     switch_off()
-
-
-def small_road(*classes):
-    road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.default_rng(1))
-    for number, kind in enumerate(classes):
-        road.vehicles.append(kind(road, [30.0 * number, 0.0], 0.0, 20.0))
-    return road
 
 
 class Hurried(IDMVehicle):

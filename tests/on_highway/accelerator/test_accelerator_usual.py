@@ -30,7 +30,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
-from small_roads import small_road
+from small_roads import same_either_way, small_road
 
 from crashhunt.highway.accelerator import (
     Onlooker,
@@ -162,11 +162,7 @@ def test_observations_have_the_bits_of_highway_env_whatever_they_are_set_to():
                     found.append((kind, setting, repr(error)))
         return found
 
-    slow = shown()
-    assert switch_on() == ""
-    fast = shown()
-    for one, other in zip(slow, fast, strict=True):
-        assert one == other
+    slow = same_either_way(shown)
     assert sum(len(entry) == 3 for entry in slow) <= 2  # errors
     assert len({str(entry[-2]) for entry in slow}) > 10
 
@@ -218,10 +214,7 @@ def test_odd_settings_have_what_they_have_in_highway_env():
             every += [outcome(lambda v=vehicle, h=h: observation.compute_ttc_grid(env, 1.0, h, v)) for h in (3, 2.5)]
         return every
 
-    slow = found()
-    assert switch_on() == ""
-    for one, other in zip(slow, found(), strict=True):
-        assert one == other
+    same_either_way(found)
 
 
 LEFT_TO_THE_KERNEL = {
@@ -321,10 +314,7 @@ def test_environment_is_left_as_highway_env_leaves_it():
 
     errors = 0
     for config in ({}, {"manual_control": True, "policy_frequency": 4}):
-        switch_off()
-        slow = left(HighwayEnvFast, **config)
-        assert switch_on() == ""
-        assert left(HighwayEnvFast, **config) == slow
+        slow = same_either_way(partial(left, HighwayEnvFast, **config))
         errors += sum("KeyError" in entry for entry in slow)
     assert errors > 1
 
@@ -340,10 +330,8 @@ def test_agent_acts_once_in_each_period_whatever_steps_have_run_before():
         return calls, env.steps
 
     for steps, action in product((0, 3), (None, 1)):
-        switch_off()
-        slow = acted(steps, action)
-        assert switch_on() == ""
-        assert acted(steps, action) == slow == ([] if action is None else [-(-steps // 8) * 8], steps + 8)
+        expected = ([] if action is None else [-(-steps // 8) * 8], steps + 8)
+        assert same_either_way(partial(acted, steps, action)) == expected
 
 
 def test_usual_change_of_the_target_speed_needs_no_code_of_highway_env():
