@@ -434,7 +434,7 @@ class ContactRecord(Approach):
 
     def stood_s(self, actor: str) -> float:
         """Return how long an actor had stood still until the contact, in s; 0 if it moved when the actors touched."""
-        if self.speed_at_contact(actor) >= STANDS_MPS:
+        if abs(self.speed_at_contact(actor)) >= STANDS_MPS:
             return 0.0
         found, place = 0.0, None
         for scene in reversed(self.scenes):
@@ -444,11 +444,11 @@ class ContactRecord(Approach):
             if row is None:
                 break
             ago = self.time_s - scene.time_s
-            if scene.speeds[row] >= STANDS_MPS:
+            if (speed := abs(scene.speeds[row])) >= STANDS_MPS:
                 if place is None:
                     break
                 # It stopped between two scenes. With a constant deceleration, the distance says when.
-                moved_s = 2 * math.dist(scene.points[row], place) / scene.speeds[row]
+                moved_s = 2 * math.dist(scene.points[row], place) / speed
                 return max(found, ago - moved_s)
             found, place = ago, scene.points[row]
         return found

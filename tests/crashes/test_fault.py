@@ -198,6 +198,10 @@ def test_who_changes_lanes_into_a_gap_that_is_too_short():
     away = straight(15, 5, before=0.0, since=0.1, y=4.0)
     assert verdict(drive(straight(25), away)) != "the other"
     assert verdict(drive(straight(25), cuts_in, lanes=Map([], (0.0, 0.0)))) == "nobody can tell"
+    # Into one that stands; one that reverses comes to meet it.
+    late = straight(10, before=4.0, since=0.8)
+    assert fault_in(drive(late, straight(0, 5))).findings[0].rule == "lane change"
+    assert verdict(drive(late, straight(-3, 5))) == "nobody can tell"
 
 
 def turning_left(after_s, speed=5.0, at=5.0):
