@@ -147,7 +147,7 @@ class Approach:
         dx, dy = own.centers[back] - other.centers[back]
         return float(dx * math.cos(other.headings[back]) + dy * math.sin(other.headings[back]))
 
-    def gap_m(self, actor: str, back: int = -1) -> float:
+    def gap_m(self, actor: str, back: int) -> float:
         """Return the distance from the other actor's front to an actor's rear, along the other's heading, in m."""
         own, other = self.way(actor), self.way(self.partner(actor))
         return self.ahead_m(actor, back) - (own.length + other.length) / 2
