@@ -1,4 +1,4 @@
-/* Numbers of the report and of the dashboard, in the form of `format_number` in Python, and the bars of arguments. */
+/* Numbers of the report and of the dashboard, in the form of `format_number` in Python; arguments as bars and commands. */
 function formatNumber(value) {
   if (typeof value !== "number" || !Number.isFinite(value)) return "-";
   const size = Math.abs(value);
@@ -10,6 +10,16 @@ function formatNumber(value) {
 /* Two decimals, as in texts and tables. */
 function formatCriticality(value) { return typeof value === "number" && Number.isFinite(value) ? value.toFixed(2) : "-"; }
 function formatPercent(share) { return `${formatNumber(100 * share)} %`; }
+
+function quoted(text) { return /^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`; }
+/* The command that runs the arguments of a trial again, with other seeds. */
+function commandAgain({ maxSteps, scenario, agents, scenarioArguments, disturb }, values) {
+  const words = ["crashhunt", "run", "again", "0", "100", String(maxSteps), "--scenario", scenario], drivers = Object.entries(agents);
+  for (const [id, agent] of drivers) words.push("--agent", drivers.length > 1 ? `${id}=${agent}` : agent);
+  for (const [name, value] of Object.entries(values)) words.push(scenarioArguments.includes(name) ? "--set" : "--arg", `${name}=${value}`);
+  if (disturb) words.push("--disturb", disturb);
+  return words.map(quoted).join(" ");
+}
 
 /* The share that each argument explains, with its interval. */
 function importanceBars(importance) {

@@ -102,7 +102,6 @@ export function ago(value) {
 export const stateOf = (row) => (row.exported ? "exported" : row.state === "crashed" ? `finished, ${plural(row.crashes, "crash", "crashes")}` : row.state);
 export const plural = (number, one, many) => `${count(number)} ${number === 1 ? one : many}`;
 export const short = (value) => (typeof value === "number" ? formatNumber(value) : String(value));
-export const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
 export function setText(node, text) {
   const wanted = String(text);

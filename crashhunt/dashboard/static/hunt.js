@@ -1,5 +1,5 @@
 /* The page of one hunt. */
-import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, quoted, seconds, setText, short, stateOf, sinceNewestKind, spelled, table, tell } from "/static/common.js";
+import { $, PALETTE, Refused, between, copyButton, count, css, draw, drawTheRest, drawWhenNear, get, make, mayControl, now, onScheme, plural, poll, post, seconds, setText, short, stateOf, sinceNewestKind, spelled, table, tell } from "/static/common.js";
 
 const ID = location.pathname.split("/")[2], API = `/api/hunts/${ID}`;
 const NOT_DECIDED = "nobody can tell"; // the verdict of the API
@@ -349,12 +349,8 @@ function pick(number) {
   const one = byNumber.get(number), panel = $("picked");
   panel.hidden = false;
   if (!one) { panel.replaceChildren(make("p", `Trial ${number} is not in the plots. Run: crashhunt trials ${quoted(hunt.path)}`)); return; }
-  const run = ["crashhunt", "run", "again", "0", "100", String(hunt.max_steps), "--scenario", hunt.scenario];
-  const agents = Object.entries(hunt.agents), scenario = new Set(hunt.scenario_columns);
-  for (const [id, agent] of agents) run.push("--agent", agents.length > 1 ? `${id}=${agent}` : agent);
-  for (const [name, value] of Object.entries(one.values)) run.push(scenario.has(name) ? "--set" : "--arg", `${name}=${value}`);
-  if (hunt.settings.disturbances) run.push("--disturb", hunt.settings.disturbances);
-  const command = run.map(quoted).join(" "), box = make("div", undefined, "command");
+  const asked = { maxSteps: hunt.max_steps, scenario: hunt.scenario, agents: hunt.agents, scenarioArguments: hunt.scenario_columns, disturb: hunt.settings.disturbances };
+  const command = commandAgain(asked, one.values), box = make("div", undefined, "command");
   box.append(make("span", "run its arguments again, with other seeds"), make("code", command), copyButton(command, `the arguments of trial ${number}`));
   const facts = make("dl");
   facts.append(...[["outcome", one.outcome], ["steps", one.steps], ["criticality", formatCriticality(one.danger)], ["disturbances", one.disturbances], ["least time to collision with any actor", one.ttc === null ? "-" : `${one.ttc.toFixed(1)} s`], ["came from", [one.origin, one.parent === null ? "" : `trial ${one.parent}`].filter((part) => part).join(", ") || "-"], ...Object.entries(one.values).map(([name, value]) => [name, `${short(value)}${units[name] ? ` ${units[name]}` : ""}`])].flatMap(([name, value]) => [make("dt", name), make("dd", value, "mono")]));
