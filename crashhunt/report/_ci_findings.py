@@ -160,7 +160,7 @@ def crash_annotations(findings: Sequence[CrashFinding]) -> list[str]:
     GitHub shows at most ten annotations. If there are more, a notice gives the number shown and the total.
     """
     found = [
-        _command("error", finding.title, finding.message, finding.file, finding.line)
+        annotation_of("error", finding.title, finding.message, finding.file, finding.line)
         for finding in findings
         if not finding.known
     ]
@@ -196,10 +196,10 @@ def corpus_annotations(reports: Sequence[CaseReport]) -> list[str]:
         file = (report.path / layout.CASE).as_posix()
         if not report.ok:
             title, *words = report.describe().splitlines()
-            found.append(_command("error", title, "\n".join(words) or title, file, 1))
+            found.append(annotation_of("error", title, "\n".join(words) or title, file, 1))
         elif report.may_be_tightened:
             words = ["Set expect = 'fixed', to be warned if it crashes again"]
-            tighter.append(_command("notice", f"{report.path.name}: is fixed", words[0], file, 1))
+            tighter.append(annotation_of("notice", f"{report.path.name}: is fixed", words[0], file, 1))
     return [*_limited(found, "cases that are not as expected"), *_limited(tighter, "fixed cases")]
 
 
@@ -209,7 +209,7 @@ def _limited(annotations: Sequence[str], what: str) -> list[str]:
     if count <= _MAX_ANNOTATIONS:
         return shown
     said = f"{_MAX_ANNOTATIONS} of {count} {what} are annotated. The summary of the job has all of them."
-    return [_command("notice", f"{_MAX_ANNOTATIONS} of {count} {what} shown", said, "", 1), *shown]
+    return [annotation_of("notice", f"{_MAX_ANNOTATIONS} of {count} {what} shown", said), *shown]
 
 
 def row_of(cells: Sequence[str]) -> str:
@@ -222,7 +222,8 @@ def escaped(text: str) -> str:
     return _MARKDOWN_SPECIAL.sub(r"\\\1", one_line(text))
 
 
-def _command(level: str, title: str, message: str, file: str, line: int) -> str:
+def annotation_of(level: str, title: str, message: str, file: str = "", line: int = 1) -> str:
+    """Return a GitHub annotation command, at a line of a file if one is given."""
     place = f"file={_value(file)},line={line}," if file else ""
     return f"::{level} {place}title={_value(title)}::{_data(message)}"
 

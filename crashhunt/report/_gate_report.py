@@ -7,7 +7,7 @@ from xml.etree import ElementTree as Xml
 
 from crashhunt.base.files import output_file
 from crashhunt.base.text import command_line, count_of, format_number, in_lines, visible
-from crashhunt.report._ci_findings import escaped, row_of
+from crashhunt.report._ci_findings import annotation_of, escaped, row_of
 from crashhunt.report._rate_text import count_training_trials, format_interval
 
 if TYPE_CHECKING:
@@ -219,9 +219,7 @@ def gate_annotations(found: GateReport) -> list[str]:
         return []
     level = "error" if found.verdict == "worse" else "warning"
     title, *words = describe_gate(found).splitlines()
-    text = "\n".join(words).replace("%", "%25").replace("\n", "%0A")
-    heading = title.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
-    return [f"::{level} title=crashhunt gate%3A {heading}::{text}"]
+    return [annotation_of(level, f"crashhunt gate: {title}", "\n".join(words))]
 
 
 def write_gate_junit(found: GateReport, path: Path) -> None:
