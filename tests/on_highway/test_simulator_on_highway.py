@@ -22,6 +22,7 @@ from test_parts_on_highway import planned, put, straight
 
 from crashhunt.highway import _simulator
 from crashhunt.highway._disturbances import HighwayDisturbances
+from crashhunt.highway._lanes_and_contacts import is_at_an_end
 
 
 @pytest.fixture
@@ -114,6 +115,6 @@ def test_generator_of_the_road_is_reseeded_where_it_is_another_one(simulator):
 def test_vehicle_arrives_at_the_end_of_a_lane_that_leads_nowhere(simulator, x, y, at_an_end):
     vehicle = put(simulator._env.road, 900.0, 1)
     vehicle.position = np.array([x, y])
-    assert bool(simulator._is_at_an_end(vehicle)) is at_an_end
+    assert bool(is_at_an_end(vehicle, simulator._env.road.network)) is at_an_end
     simulator._env.road.network.graph["1"] = {}
-    assert not simulator._is_at_an_end(vehicle)
+    assert not is_at_an_end(vehicle, simulator._env.road.network)
