@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from ._protocol import (
         ChoosesParallelism as ChoosesParallelism,
         Executor as Executor,
-        ExecutorFactory as ExecutorFactory,
         HasNodes as HasNodes,
         NodeFigures as NodeFigures,
         make_executor as make_executor,

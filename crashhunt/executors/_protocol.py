@@ -87,23 +87,6 @@ class HasNodes(Protocol):
         """Return the machines that currently run trials; empty while the hunt waits for all machines."""
 
 
-class ExecutorFactory(Protocol):
-    """The factory of ``--executor NAME``, which creates the executor of a hunt.
-
-    With ``--executor NAME:ARG``, the factory is also called with ``argument=ARG``. A factory without an argument need
-    not accept this keyword. If no trial can run, the factory raises a `CrashhuntError` with the fix before it starts
-    any process. See also `ChoosesParallelism`.
-    """
-
-    def __call__(self, settings: WorkerSettings, *, parallel: int) -> Executor:
-        """Create an executor for a hunt.
-
-        Args:
-            settings: settings of the hunt.
-            parallel: number of trials that run at a time.
-        """
-
-
 # The shapes of what a hunt and its processes tell each other, as JSON.
 #
 # A replay talks to the crashhunt of a snapshot, so what earlier versions did not say need not be there.
