@@ -27,7 +27,7 @@ from crashhunt.dashboard._control import Jobs, stop_hunt
 from crashhunt.dashboard._crash_list import CrashList
 from crashhunt.dashboard._details import HuntComparer, detail_of, importance_of_points
 from crashhunt.dashboard._hunt_page import HuntView
-from crashhunt.dashboard._security import Guard
+from crashhunt.dashboard._security import Guard, error_response
 from crashhunt.report import argument_units, player_parts
 from crashhunt.results import CodeVersions
 
@@ -90,12 +90,12 @@ def make_application(catalog: Catalog, *, host: str, token: str = "", allow_cont
             Route("/api/hunts/{hunt}/crashes/{crash}/jobs/{job}", answers.job_add, methods=["POST"]),
         ]
     handlers: Any = {
-        404: lambda _request, _: _error(404, "there is no such page"),
-        405: lambda _request, _: _error(405, "the dashboard only reads"),
-        _NotFound: lambda _request, error: _error(404, *error.args),
+        404: lambda _request, _: error_response(404, "there is no such page"),
+        405: lambda _request, _: error_response(405, "the dashboard only reads"),
+        _NotFound: lambda _request, error: error_response(404, *error.args),
         CrashhuntError: lambda _request, error: _from_error(error),
-        OSError: lambda _request, error: _error(500, str(error.strerror or error)),
-        500: lambda _request, error: _error(500, f"this should not happen: {type(error).__name__}"),
+        OSError: lambda _request, error: error_response(500, str(error.strerror or error)),
+        500: lambda _request, error: error_response(500, f"this should not happen: {type(error).__name__}"),
     }
     inner = Starlette(routes=routes, exception_handlers=handlers)
     return Application(Guard(inner, host=host, token=token, control=allow_control), answers.jobs.close)
@@ -116,7 +116,7 @@ class _Endpoints:
             return Response(_plotly(), media_type="text/javascript", headers=_lasting(request, name))
         text = _assets().get(name)
         if text is None:
-            return _error(404, "there is no such file")
+            return error_response(404, "there is no such file")
         kind = _CONTENT_TYPES[name.rpartition(".")[2]]
         return Response(text, media_type=kind, headers=_lasting(request, name))
 
@@ -320,11 +320,6 @@ def _digest(row: JsonObject) -> bytes:
     """Return the digest of a row, without the values that change only with the clock."""
     row = {name: value for name, value in row.items() if name != "newest_kind_s"}
     return hashlib.blake2b(json.dumps(row, default=str).encode("utf-8", "replace"), digest_size=12).digest()
-
-
-def _error(status: int, message: str, fix: str = "", where: str = "") -> Response:
-    data = {"error": {"message": message, "fix": fix, "where": where}}
-    return JSONResponse(data, status, headers=_NO_STORE)
 
 
 def _from_error(error: Exception) -> Response:

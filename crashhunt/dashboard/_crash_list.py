@@ -12,7 +12,7 @@ from crashhunt.base.errors import BundleError, CrashhuntError
 from crashhunt.base.text import command_line
 from crashhunt.crashes import crash_folders, fault_of, most_dangerous, preventable_by, read_bundle, signature_of
 from crashhunt.dashboard._catalog import FoundHunt, is_inside, unreadable, unreadable_below
-from crashhunt.dashboard._hunt_page import read_tail
+from crashhunt.dashboard._hunt_page import read_tail, sign_of
 from crashhunt.ledger import Ledger, has_begun
 from crashhunt.recording import read_lanes, read_obstacles
 from crashhunt.report import Story, lineage_of, player_data
@@ -31,9 +31,9 @@ _MAX_MAP_LOGS = 40  # that lanes are read from
 
 
 class _Entry(NamedTuple):
-    """A bundle, with the time at which its ``crash.json`` was written."""
+    """A bundle, with the state of its ``crash.json``."""
 
-    written: tuple[int, int]
+    written: tuple[int, int, int]
     row: JsonObject
 
 
@@ -43,7 +43,7 @@ class CrashList:
     def __init__(self, found: FoundHunt) -> None:
         self._found = found
         self._entries: dict[str, _Entry] = {}
-        self._analysed: dict[str, tuple[tuple[int, int], JsonObject]] = {}
+        self._analysed: dict[str, tuple[tuple[int, int, int], JsonObject]] = {}
         self._lanes: dict[str, list[list[float]]] = {}
         self._obstacles: dict[str, list[list[float]]] = {}
         self._lock = threading.RLock()
@@ -103,7 +103,7 @@ class CrashList:
             }
 
     def _row(self, name: str, folder: Path) -> JsonObject:
-        written = _written(folder / layout.CRASH)
+        written = sign_of(folder / layout.CRASH)
         known = self._entries.get(name)
         if known is not None and known.written == written:
             return known.row
@@ -146,7 +146,7 @@ class CrashList:
 
     def _analyse(self, unknown: Sequence[tuple[str, Path]]) -> None:
         for name, folder in unknown:
-            written = _written(folder / layout.CRASH)
+            written = sign_of(folder / layout.CRASH)
             said: JsonObject = {"type": None, "fault": None}
             try:
                 said |= _analysis(self._read(folder))
@@ -246,14 +246,6 @@ def _unique(lines: Mapping[str, list[list[float]]], names: Iterable[str]) -> lis
 
 def _is_near_miss(folder: Path) -> bool:
     return folder.parent.name == layout.NEAR_MISSES
-
-
-def _written(path: Path) -> tuple[int, int]:
-    try:
-        found = path.stat()
-    except OSError:
-        return 0, 0
-    return found.st_mtime_ns, found.st_size
 
 
 def _summary(bundle: Bundle) -> JsonObject:

@@ -57,7 +57,7 @@ class HuntView:
         self._lock = threading.RLock()
         self._key: _Key = ()
         self._file: tuple[int, int] = (0, 0)
-        self._settings_key: tuple[int, int] = (0, 0)
+        self._settings_key = (0, 0, 0)
         self._why_unreadable: Paced[str] = Paced()
         self.settings: HuntSettings | None = None
         self.facts: Facts = {}
@@ -115,7 +115,7 @@ class HuntView:
                 f"the directory has no {layout.HUNT}",
                 fix=f"run {command_line('crashhunt', 'check', self.path)} to see what is left",
             )
-        key = (_sign(ledger), _sign(ledger.with_name(f"{ledger.name}-wal")))
+        key = (sign_of(ledger), sign_of(ledger.with_name(f"{ledger.name}-wal")))
         if key != self._key or self.counts is None or (points and self.sample is None):
             self._read(ledger, points=points)
             self._key = key
@@ -124,7 +124,7 @@ class HuntView:
         return replace(
             with_crash_counts(state, self.facts, self.counts.crashes),
             code_versions=self._versions or None,
-            notes=self._notes(_sign(self.path / layout.NOTES), lambda: list(read_notes(self.path)), now=True) or None,
+            notes=self._notes(sign_of(self.path / layout.NOTES), lambda: list(read_notes(self.path)), now=True) or None,
             **self._sums_of_copies,
         )
 
@@ -136,18 +136,12 @@ class HuntView:
         snapshots = self.path / layout.SNAPSHOTS
         if why := unreadable(self.path, self.found.root):
             return why
-        return self._why_unreadable(_sign(snapshots), lambda: unreadable_below(snapshots, self.found.root), now=True)
+        return self._why_unreadable(sign_of(snapshots), lambda: unreadable_below(snapshots, self.found.root), now=True)
 
     def _read_settings(self) -> None:
         path = self.path / layout.HUNT
-        try:
-            found = path.stat()
-        except OSError:
-            self.settings, self._settings_key = None, (0, 0)
-            return
-        key = found.st_mtime_ns, found.st_size
-        if key != self._settings_key:
-            self.settings = read_settings(path)
+        if (key := sign_of(path)) != self._settings_key:
+            self.settings = read_settings(path) if any(key) else None
             self._settings_key = key
             self._forget()
 
@@ -244,7 +238,7 @@ class HuntView:
             return None
         try:
             held_out = self._held_out(
-                _sign(self.path / layout.SNAPSHOTS), lambda: held_out_traffics(settings, [self.path]), now=True
+                sign_of(self.path / layout.SNAPSHOTS), lambda: held_out_traffics(settings, [self.path]), now=True
             )
         except CrashhuntError as error:
             return {"why_not": str(error)[:_MAX_ERROR_CHARACTERS]}
@@ -282,8 +276,8 @@ def _rate_data(rate: CrashRate) -> JsonObject:
     return {name: data[name] for name in names}
 
 
-def _sign(path: Path) -> tuple[int, int, int]:
-    """Return a value that changes when the file changes."""
+def sign_of(path: Path) -> tuple[int, int, int]:
+    """Return a value that changes when the file changes; zeros if the file is missing."""
     try:
         found = path.stat()
     except OSError:

@@ -118,7 +118,7 @@ class Guard:
         self._requests += 1
         try:
             if self._requests > MAX_REQUESTS:
-                busy = _refused(503, f"more than {MAX_REQUESTS} requests at a time", "try again in a second")
+                busy = error_response(503, f"more than {MAX_REQUESTS} requests at a time", "try again in a second")
                 await busy(scope, receive, send_with_headers)
                 return
             await self._app(scope, _bounded(receive), send_with_headers)
@@ -127,22 +127,22 @@ class Guard:
 
     def _refusal(self, scope: Scope, headers: _Headers) -> Response | None:
         if len(scope.get("raw_path") or b"") + len(scope["query_string"]) > MAX_TARGET:
-            return _refused(414, "the address is too long", f"give at most {MAX_TARGET} characters")
+            return error_response(414, "the address is too long", f"give at most {MAX_TARGET} characters")
         if headers.size > MAX_HEADERS:
-            return _refused(431, "the headers are too large", f"send at most {MAX_HEADERS} bytes")
+            return error_response(431, "the headers are too large", f"send at most {MAX_HEADERS} bytes")
         if headers.repeated:
-            return _refused(400, f"the header {headers.repeated} occurs twice", "send it once")
+            return error_response(400, f"the header {headers.repeated} occurs twice", "send it once")
         host = headers.only("host")
         if host is None or not self._is_ours(host):
             fix = "open the address that crashhunt dashboard printed"
-            return _refused(421, "the Host header names another machine", fix)
+            return error_response(421, "the Host header names another machine", fix)
         if (length := headers.only("content-length")) is not None and not _is_small(length):
-            return _refused(413, "the request is too large", f"send at most {MAX_BODY} bytes")
+            return error_response(413, "the request is too large", f"send at most {MAX_BODY} bytes")
         reads = scope["method"] in ("GET", "HEAD")
         if not reads and not (self._control and scope["method"] == "POST"):
-            return _refused(405, "the dashboard only reads", "start it with --allow-control to control hunts")
+            return error_response(405, "the dashboard only reads", "start it with --allow-control to control hunts")
         if self._is_foreign(scope, headers, host):
-            return _refused(403, "another site sent this request", "open the page itself")
+            return error_response(403, "another site sent this request", "open the page itself")
         return self._without_token(scope, headers) if self._token else None
 
     def _is_ours(self, host: str) -> bool:
@@ -185,7 +185,7 @@ class Guard:
             return None
         if self._fits(_cookie(headers)):
             return None
-        return _refused(401, "the token is missing or wrong", "open the address that crashhunt dashboard printed")
+        return error_response(401, "the token is missing or wrong", "open the address that crashhunt dashboard printed")
 
     def _fits(self, given: str) -> bool:
         return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token)
@@ -242,7 +242,7 @@ def _bounded(receive: Receive) -> Receive:
     return bounded
 
 
-def _refused(status: int, message: str, fix: str) -> Response:
+def error_response(status: int, message: str, fix: str = "") -> Response:
     """Return an error response in the JSON form that every command's ``--json`` has."""
     return JSONResponse(
         {"error": {"message": message, "fix": fix, "where": ""}}, status, headers={"cache-control": "no-store"}
