@@ -7,7 +7,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crashhunt.base import layout
 from crashhunt.base.errors import FULL, HuntDirectoryError
@@ -157,7 +157,10 @@ def _sync(path: str | Path) -> None:
         os.close(opened)
 
 
+FREE_SPACE: Final = "free some space and run the same command again"
+
+
 def cannot_write(path: Path, error: OSError) -> HuntDirectoryError:
     """Return the error for a file or folder that cannot be written."""
-    fix = "free some space and run the same command again" if error.errno in FULL else "choose another place"
+    fix = FREE_SPACE if error.errno in FULL else "choose another place"
     return HuntDirectoryError(f"cannot be written: {error.strerror or error}", fix=fix, where=str(path))

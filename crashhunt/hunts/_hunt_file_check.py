@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, CrashhuntError, HuntDirectoryError, remedy
+from crashhunt.base.files import FREE_SPACE
 from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.process_owners import has_ended, owner_in
 from crashhunt.base.resources import error_of_next_files, limit_behind
@@ -198,7 +199,7 @@ def _check_ledger(found: Checked, hunt: Path, settings: HuntSettings | None) -> 
                     crashes[number] = row[10]
             return {number: TrialResult.from_json(json.loads(text)) for number, text in crashes.items()}
     except HuntDirectoryError as error:
-        if error.fix == HOW_TO_READ:
+        if error.fix in (HOW_TO_READ, FREE_SPACE):
             raise  # nothing is damaged
         found.report(path, error.message, lost="all trials but the crashes", fix=_RESUME_FIX)
         return None

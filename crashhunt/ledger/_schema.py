@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crashhunt.base.errors import HuntDirectoryError, remedy
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import FREE_SPACE, whole_file
 from crashhunt.base.integrity import digest_of_row
 from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.resources import error_of_next_files, limit_behind
@@ -231,9 +231,7 @@ def _explanation(path: Path, error: sqlite3.Error) -> HuntDirectoryError:
         what, _, fix = limit.partition(": ")
         return HuntDirectoryError(f"cannot be written ({text}), because {what}", fix=fix, where=where)
     if "full" in text or "disk I/O" in text:
-        return HuntDirectoryError(
-            f"the disk is full ({text})", fix="free some space and run the same command again", where=where
-        )
+        return HuntDirectoryError(f"the disk is full ({text})", fix=FREE_SPACE, where=where)
     if "locked" in text:
         return HuntDirectoryError(
             f"another program keeps it busy ({text})", fix="close what has it open, and try again", where=where
@@ -274,6 +272,15 @@ def leave_untouched() -> Iterator[None]:
 def is_untouched() -> bool:
     """Return whether the caller is inside the context of `leave_untouched`."""
     return _untouched.get()
+
+
+def may_write(path: Path) -> bool:
+    """Return whether a reader can write SQLite's files next to a ledger.
+
+    It cannot in another user's folder, on a read-only file system, or on a full disk.
+    """
+    disk = os.statvfs(path.parent)
+    return os.access(path.parent, os.W_OK) and (disk.f_blocks == 0 or disk.f_bavail > 0)
 
 
 _BUSY_S = 10.0  # for another process to release its lock on the file

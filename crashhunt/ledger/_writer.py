@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sqlite3
 import time
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,6 +26,7 @@ from crashhunt.ledger._schema import (
     damaged,
     explained,
     is_untouched,
+    may_write,
     opened,
     removed,
     rewrite,
@@ -84,8 +84,7 @@ class Ledger(LedgerReader):
         with explained(path):
             if writable and not has_begun(path):
                 create(path)
-            may_write = os.access(path.parent, os.W_OK)  # not on a read-only file system, or in another user's folder
-            database = opened(path, read_only=read_only or (not writable and (is_untouched() or not may_write)))
+            database = opened(path, read_only=read_only or (not writable and (is_untouched() or not may_write(path))))
             database.wait = wait
             with ExitStack() as failed:
                 failed.callback(database.close)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.errors import BusyError, CrashhuntError, HuntDirectoryError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import cannot_write, whole_file
 from crashhunt.base.process_owners import this_process
 from crashhunt.base.temporary import remove_ended, remove_scratch, temporary_beside
 from crashhunt.ledger import Ledger, has_begun
@@ -88,10 +88,12 @@ class HuntDirectory:
                     where=str(self.path),
                 ) from None
             self._refuse_foreign()
-            lock.truncate(0)
-            lock.write(str(os.getpid()))
-            lock.flush()
             try:
+                lock.truncate(0)
+                try:  # without a buffer, which would be written again when the file is closed
+                    os.write(lock.fileno(), b"%d" % os.getpid())
+                except OSError as error:
+                    raise cannot_write(self.path, error) from error
                 with temporary_beside(self.path / layout.LEDGER, name=self.scratch.name):
                     yield
             except BaseException:

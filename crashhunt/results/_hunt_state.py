@@ -272,7 +272,7 @@ def _hunt_state(directory: Path) -> HuntState:
         if not (directory / layout.LEDGER).exists():
             raise
         # One that cannot be read hides no other.
-        return HuntState(str(directory), "error", str(error), damaged=True)
+        return HuntState(str(directory), "error", str(error).removeprefix(f"{directory}/"), damaged=True)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:  # facts of an early ledger
         wrong = damaged(directory / layout.LEDGER, f"a fact cannot be read: {type(error).__name__}: {error}")
         return HuntState(str(directory), "error", str(wrong), damaged=True)

@@ -20,6 +20,7 @@ from crashhunt.errors import BundleError, CrashhuntError, HuntDirectoryError
 from crashhunt.hunts import check, salvage
 from crashhunt.hunts._hunt_file_check import intact_snapshots
 from crashhunt.ledger import Ledger, Turn
+from crashhunt.results import hunt_state
 from crashhunt.results._hunt_state import ledger_owner
 from crashhunt.trial import Outcome
 
@@ -90,6 +91,16 @@ def test_a_low_limit_on_open_files_is_not_taken_for_damage(hunt, monkeypatch):
     monkeypatch.setattr("resource.getrlimit", lambda which: (5, 5))
     with pytest.raises(CrashhuntError, match="cannot open files: Too many open files; the limit on open files is 5: "):
         check(hunt)
+
+
+def test_a_full_disk_is_not_taken_for_damage(hunt, monkeypatch):
+    def opened(*_, **__):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr("crashhunt.ledger._writer.opened", opened)
+    with pytest.raises(HuntDirectoryError, match="the disk is full"):
+        check(hunt)
+    assert hunt_state(hunt).detail.startswith("ledger.sqlite: the disk is full")  # `status` writes the folder before it
 
 
 def test_a_row_that_has_changed_is_a_damaged_trial(hunt):

@@ -9,6 +9,7 @@ import resource
 import sqlite3
 import threading
 from contextlib import closing, suppress
+from types import SimpleNamespace
 
 import pytest
 
@@ -276,6 +277,15 @@ def test_ledger_of_another_user_is_read_without_a_trace(path, how):
     with closing(Ledger(path)) as reader:
         assert reader.finished() == {0}
         reader._database.execute("CREATE TABLE t (a)")  # it is not opened read-only
+
+
+def test_ledger_on_a_full_disk_is_read(path, monkeypatch):
+    """SQLite could not create its files next to it, so `crashhunt check` called an intact ledger damaged."""
+    with closing(Ledger(path, writable=True)) as writer:
+        write(writer, result(0))
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_blocks=9, f_bavail=0))
+    with closing(Ledger(path)) as reader:
+        assert (reader.finished(), files(path)) == ({0}, ["ledger.sqlite"])
 
 
 def test_untouched_reader_sees_what_a_running_hunt_has_written(ledger, path):

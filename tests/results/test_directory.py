@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import queue
 import threading
 from multiprocessing import get_context
@@ -85,6 +87,21 @@ def test_what_a_hunt_left_that_could_not_begin_is_in_nobodys_way(tmp_path):
     (tmp_path / ".scratch").mkdir()
     with HuntDirectory(tmp_path).locked():
         pass
+
+
+def test_full_disk_is_named_by_the_directory_that_is_on_it(tmp_path, monkeypatch):
+    """The error of a write names no file, so crashhunt took it for one of its standard output."""
+
+    def refuse(descriptor, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("crashhunt.results._hunt_directory.os", SimpleNamespace(write=refuse, getpid=os.getpid))
+    with (
+        pytest.raises(HuntDirectoryError, match="h: cannot be written: No space left"),
+        HuntDirectory(tmp_path / "h").locked(),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def _fail(place, *, begins=False, file=""):
