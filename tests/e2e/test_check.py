@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import py_compile
 import random
 import shutil
 import sqlite3
+import traceback
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from damage import (
-    command,
-    damage_archive,
-)
 
 import crashhunt
 from crashhunt.base.integrity import digest_of_data
+from crashhunt.cli import main
 from crashhunt.errors import HuntDirectoryError
 
 HUNT = ("1", "8", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
@@ -54,21 +54,45 @@ def edited(path, change, *, schema: int = 2):
     path.write_text(json.dumps(data))
 
 
-@pytest.mark.parametrize(("seed", "times"), [(5, 4), pytest.param(6, 60, marks=pytest.mark.nightly)])
-def test_damaged_archives_are_one_line(tmp_path, monkeypatch, seed, times):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+def command(*words: object) -> tuple[int, str, str]:
+    """Run a command in this process: exit code, or -1 for a traceback; standard output; standard error."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(word) for word in words])
+        except SystemExit as ended:
+            code = ended.code or 0
+        except BaseException:
+            traceback.print_exc(file=err)
+            code = -1
+    return code, out.getvalue(), err.getvalue()
+
+
+JUNK = (None, True, -1, 0, 10**30, 1e308, "", "x", "../../etc", "\ud800\x1b[2J", [], [[]], {}, {"x": 1})
+
+
+@pytest.mark.parametrize(("seed", "times"), [(5, 12), pytest.param(6, 60, marks=pytest.mark.nightly)])
+def test_any_value_in_a_crash_json_is_at_most_one_line(tmp_path, seed, times):
     generator = random.Random(seed)
-    whole = (Path(__file__).parent / "frozen" / "version-1" / "fault.zip").read_bytes()
-    bad = tmp_path / "bad.zip"
+    crash = Path(shutil.copytree(Path(__file__).parent / "frozen" / "version-1" / "hunt", tmp_path / "h"), "crashes",
+                 "000000-collision")  # fmt: skip
+    before = (crash / "crash.json").read_text()
     for _ in range(times):
-        if bad.is_dir():
-            bad.rmdir()
-        bad.write_bytes(whole)
-        what = damage_archive(bad, generator)
-        for words in (("show", bad), ("check", bad, "--json")):
+        data = json.loads(before)
+        del data["integrity"]
+        here, path = data, []
+        while True:
+            path.append(generator.choice(list(here) if isinstance(here, dict) else range(len(here))))
+            if not isinstance(here[path[-1]], dict | list) or not here[path[-1]] or generator.random() < 0.3:
+                break
+            here = here[path[-1]]
+        here[path[-1]] = generator.choice(JUNK)
+        (crash / "crash.json").write_text(json.dumps({**data, "integrity": digest_of_data(data)}))
+        for words in (("show", crash), ("check", crash, "--json")):
             code, _, err = command(*words)
-            assert code in (0, 1, 2), (what, words, err)
-            assert len([line for line in err.splitlines() if line.startswith("crashhunt:")]) <= 1, (what, err)
+            assert code in (0, 1, 2), (path, here[path[-1]], words, err)
+            assert "this should not happen" not in err, (path, here[path[-1]], err)
+            assert len([line for line in err.splitlines() if line.startswith("crashhunt:")]) <= 1, (path, err)
 
 
 def test_a_crash_json_that_was_edited_is_refused(hunt, crash):
