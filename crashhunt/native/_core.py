@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # Not part of this package: a snapshot of the code has no compiled part, and uses the one that is installed, if any.
 _MODULE = "_crashhunt_core"
-_INTERFACE = 21
+_INTERFACE = 22
 """Version of the core's functions; a core with another version is not used. scripts/build_core.py reads this number."""
 _CHECKED_VERSIONS = ("1.28.0",)
 """The versions of libsumo whose functions the core can call."""
@@ -45,6 +45,8 @@ class Columns(Protocol):
     """In rad."""
     speeds: list[float]
     """In m/s."""
+    recorded: bytes
+    """All numbers in the order of their record, as float64."""
 
     def speed(self, row: int, /) -> float:
         """Return the speed of an actor, in m/s."""
@@ -538,17 +540,6 @@ class Core(Protocol):
 
     def least_change(self, earlier: Columns, later: Columns, /) -> float | None:
         """Return the least change of speed of any actor between two scenes (m/s); 0 in an empty scene."""
-
-    def write_step(
-        self, buffer: object, offset: int, tag: int, step: int, time_s: float, rewards: tuple[float, ...],
-        columns: Columns, phase: int, /,
-    ) -> int | None:  # fmt: skip
-        """Write the record of a step and the phase of the process; return the position after the record."""
-
-    def write_array(
-        self, buffer: object, offset: int, tag: int, agent: int, array: object, step: int, phase: int, /
-    ) -> int | None:
-        """Write the record of an array and the phase of the process; return the position after the record."""
 
     def changes_of(self, earlier: memoryview, now: memoryview, /) -> bytes:
         """Return where two arrays of 64-bit words differ, one bit per word, and then the changed words."""

@@ -6,94 +6,70 @@ const double MOST_KNOWN = 1e9; // of numbers beyond, what is rounded otherwise m
 // Successive scenes of one roster, of a Frame: (columns, row or -1, lengths, widths, numbers of the actors). Vehicles
 // may stand for the lengths, and None for the widths then, and for numbers that are the rows.
 struct Part {
-    Py_buffer buffer = {};
-    bool held = false;
+    Buffer buffer;
     size_t scenes = 0, actors = 0;
-    Py_ssize_t own = -1;
+    long own = -1;
     std::vector<double> lengths, widths;
     std::vector<int64_t> numbers;
 
-    Part() = default;
-    Part(const Part &) = delete;
-    Part(Part &&other) noexcept
-        : buffer(other.buffer), held(other.held), scenes(other.scenes), actors(other.actors), own(other.own),
-          lengths(std::move(other.lengths)), widths(std::move(other.widths)), numbers(std::move(other.numbers)) {
-        other.held = false;
-    }
-    ~Part() {
-        if (held) {
-            PyBuffer_Release(&buffer);
-        }
-    }
-
-    // False where it is not what the core knows; with an exception set where it is nothing of the kind.
+    // False where it is not what the core knows; throws where it is nothing of the kind.
     bool read(PyObject *given) {
-        if (!PyTuple_CheckExact(given) || PyTuple_GET_SIZE(given) != 5) {
-            PyErr_SetString(PyExc_TypeError, "a part of an episode has five parts itself");
-            return false;
-        }
-        own = PyLong_AsSsize_t(PyTuple_GET_ITEM(given, 1));
-        PyObject *sizes = PyTuple_GET_ITEM(given, 2), *whose = PyTuple_GET_ITEM(given, 4);
+        const auto [columns, row, sizes, others, whose] =
+            From<std::tuple<PyObject *, long, PyObject *, PyObject *, PyObject *>>::of(given);
+        own = row;
         if (Py_TYPE(sizes) == vehicles_type) {
             lengths = reinterpret_cast<Vehicles *>(sizes)->roster->lengths;
             widths = reinterpret_cast<Vehicles *>(sizes)->roster->widths;
-        } else if (PyErr_Occurred() || !numbers_of(sizes, lengths) || !numbers_of(PyTuple_GET_ITEM(given, 3), widths)) {
+        } else if (!numbers_of(sizes, lengths) || !numbers_of(others, widths)) {
             return false;
         }
         actors = lengths.size();
         if (whose != Py_None && !PyList_CheckExact(whose)) {
             return false;
         }
-        for (size_t row = 0; whose == Py_None && row < actors; row++) {
-            numbers.push_back(static_cast<int64_t>(row));
+        for (size_t number = 0; whose == Py_None && number < actors; number++) {
+            numbers.push_back(static_cast<int64_t>(number));
         }
-        for (Py_ssize_t row = 0; whose != Py_None && row < PyList_GET_SIZE(whose); row++) {
-            numbers.push_back(PyLong_AsLongLong(PyList_GET_ITEM(whose, row)));
+        if (whose != Py_None) {
+            numbers = From<std::vector<int64_t>>::of(whose);
         }
-        if (PyErr_Occurred() || widths.size() != actors || numbers.size() != actors || own < -1 ||
-            (own >= 0 && static_cast<size_t>(own) >= actors)) {
+        if (widths.size() != actors || numbers.size() != actors || own < -1 || own >= static_cast<long>(actors)) {
             return false;
         }
-        if (PyObject_GetBuffer(PyTuple_GET_ITEM(given, 0), &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+        if (!buffer.open(columns, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)) {
             PyErr_Clear(); // such as one that is not in order
             return false;
         }
-        held = true;
-        const size_t length = static_cast<size_t>(buffer.len);
-        scenes = buffer.ndim == 2 ? static_cast<size_t>(buffer.shape[0]) : 0; // also of scenes without actors
-        return buffer.itemsize == 8 && buffer.format && strchr(buffer.format, 'd') && length == scenes * 32 * actors &&
+        const Py_buffer &view = buffer.view;
+        scenes = view.ndim == 2 ? static_cast<size_t>(view.shape[0]) : 0; // also of scenes without actors
+        return view.itemsize == 8 && view.format && strchr(view.format, 'd') && buffer.size() == scenes * 32 * actors &&
                known();
     }
     // Whether all of it are numbers as there are in traffic.
     bool known() const {
-        const double *values = static_cast<const double *>(buffer.buf);
+        const double *values = scene(0);
         size_t odd = 0;
         for (size_t place = 0; place < scenes * 4 * actors; place++) {
             odd += !(fabs(values[place]) <= MOST_KNOWN);
         }
         return !odd;
     }
-    const double *scene(size_t number) const { return static_cast<const double *>(buffer.buf) + number * 4 * actors; }
+    const double *scene(size_t number) const { return static_cast<const double *>(buffer.view.buf) + number * 4 * actors; }
 };
 
-// All parts of an episode; empty where one is not what the core knows.
-bool read_parts(PyObject *list, std::vector<Part> &parts) {
-    if (!PyList_CheckExact(list)) {
-        PyErr_SetString(PyExc_TypeError, "the parts of an episode are a list");
-        return false;
-    }
-    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(list); number++) {
-        Part part;
-        if (!part.read(PyList_GET_ITEM(list, number))) {
-            return false;
+// All parts of an episode; nothing where one is not what the core knows.
+std::optional<std::vector<Part>> parts_of(List list) {
+    std::vector<Part> parts;
+    for (PyObject *given : From<std::vector<PyObject *>>::of(list)) {
+        if (!parts.emplace_back().read(given)) {
+            return {};
         }
-        parts.push_back(std::move(part));
     }
-    return true;
+    return parts;
 }
 
 // Columns of numbers, one after another, as bytes.
-template <typename Number> PyObject *bytes_of(const std::vector<std::vector<Number>> &columns) {
+template <typename Number> Ref bytes_of(const std::vector<std::vector<Number>> &columns) {
     const size_t size = columns[0].size() * sizeof(Number);
     PyObject *bytes = PyBytes_FromStringAndSize(nullptr, static_cast<Py_ssize_t>(columns.size() * size));
     char *place = bytes ? PyBytes_AS_STRING(bytes) : nullptr;
@@ -103,15 +79,10 @@ template <typename Number> PyObject *bytes_of(const std::vector<std::vector<Numb
             place += size;
         }
     }
-    return bytes;
+    return Ref(bytes);
 }
 
-PyObject *both(PyObject *one, PyObject *two) {
-    PyObject *pair = one && two ? PyTuple_Pack(2, one, two) : nullptr;
-    Py_XDECREF(one);
-    Py_XDECREF(two);
-    return pair;
-}
+typedef std::tuple<Ref, Ref> Bytes; // of numbers, and of whole numbers
 
 // A pair of outlines as NumPy measures it in crashhunt/world/_geometry.py, up to what that rounds otherwise.
 struct Pair {
@@ -187,17 +158,11 @@ struct Pair {
 // may_be_near(parts, gap, horizon, gap so far, time so far, braking so far, only the best) -> (numbers, places) | None
 // The conditions of `approaches` in world/_closest_approach.py with some slack: who fulfils them there does so here.
 // If only the best pair is asked for, pairs are left out for which another pair is certainly nearer in every measure.
-PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 7) {
-        return PyErr_Format(PyExc_TypeError, "may_be_near takes parts, five numbers and a truth");
-    }
-    const double gap = PyFloat_AsDouble(given[1]), horizon = PyFloat_AsDouble(given[2]);
-    double best_gap = PyFloat_AsDouble(given[3]), best_time = PyFloat_AsDouble(given[4]);
-    double best_braking = PyFloat_AsDouble(given[5]);
-    const bool only_best = given[6] == Py_True;
-    std::vector<Part> parts;
-    if (PyErr_Occurred() || !read_parts(given[0], parts)) {
-        return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
+std::optional<Bytes> may_be_near(List list, double gap, double horizon, double best_gap, double best_time,
+                                 double best_braking, bool only_best) {
+    const auto parts = parts_of(list);
+    if (!parts) {
+        return {};
     }
     struct Body {
         double x, y, vx, vy, c, s, reach, within, apart;
@@ -219,7 +184,7 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
     };
     int64_t step = -1;
     bool touched = only_best && best_gap == 0 && best_time == 0; // those that overlap are all as near
-    for (const Part &part : parts) {
+    for (const Part &part : *parts) {
         const size_t actors = part.actors, own = static_cast<size_t>(part.own);
         bodies.resize(actors);
         for (size_t scene = 0; scene < part.scenes; scene++) {
@@ -346,5 +311,5 @@ PyObject *may_be_near(PyObject *, PyObject *const *given, Py_ssize_t count) {
         }
         keep(one, one.actor, agent);
     }
-    return both(bytes_of(found), bytes_of(places));
+    return Bytes(bytes_of(found), bytes_of(places));
 }

@@ -20,17 +20,18 @@
 #include <exception>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <tuple>
+#include <type_traits>
 #include <unordered_map>
 #include <unordered_set>
 #include <utility>
 #include <vector>
 
-#define FAST(function) reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function)), METH_FASTCALL
-
 namespace {
 
+#include "python.hpp"
 #include "libsumo.hpp"
 #include "scenes.hpp"
 #include "near_actors.hpp"
@@ -45,76 +46,89 @@ namespace {
 // ---------------------------------------------------------------------------------------------------------- the module
 
 PyMethodDef vehicles_methods[] = {
-    {"read", vehicles_read, METH_NOARGS, "Return where everybody is; None where libsumo refuses."},
-    {"look", FAST(vehicles_look), "Return where everybody is; None where anything else has happened."},
+    {"read", METHOD(vehicles_read), "Return where everybody is; None where libsumo refuses."},
+    {"look", METHOD(vehicles_look), "Return where everybody is; None where anything else has happened."},
     {nullptr, nullptr, 0, nullptr},
 };
-PyType_Slot vehicles_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(vehicles_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<Vehicles, &Vehicles::roster>)},
-    {Py_tp_methods, vehicles_methods},
-    {Py_tp_doc, const_cast<char *>("Vehicles of the running simulation, by their ids.")},
-    {0, nullptr},
-};
 PyMethodDef columns_methods[] = {
-    {"speed", columns_speed, METH_O, "Return the speed of a row."},
+    {"speed", METHOD(columns_speed), "Return the speed of a row."},
     {nullptr, nullptr, 0, nullptr},
 };
 PyGetSetDef columns_getters[] = {
     {"points", columns_points, nullptr, "A new list of x and y.", nullptr},
     {"headings", columns_headings, nullptr, "A new list.", nullptr},
     {"speeds", columns_speeds, nullptr, "A new list.", nullptr},
+    {"recorded", columns_recorded, nullptr, "The numbers as they are recorded.", nullptr},
     {nullptr, nullptr, nullptr, nullptr, nullptr},
 };
-PyType_Slot columns_slots[] = {
-    {Py_tp_dealloc, reinterpret_cast<void *>(columns_free)},
-    {Py_tp_methods, columns_methods},
-    {Py_tp_getset, columns_getters},
-    {Py_tp_doc, const_cast<char *>("Where everybody in a scene is.")},
-    {0, nullptr},
-};
-PyType_Spec columns_spec = {"_crashhunt_core.Columns", sizeof(Columns), 0,
-                            Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, columns_slots};
-PyType_Spec vehicles_spec = {"_crashhunt_core.Vehicles", sizeof(Vehicles), 0, Py_TPFLAGS_DEFAULT, vehicles_slots};
+PyMethodDef no_methods[] = {{nullptr, nullptr, 0, nullptr}};
+PyGetSetDef no_getters[] = {{nullptr, nullptr, nullptr, nullptr, nullptr}};
 
 PyMethodDef functions[] = {
-    {"bind", bind, METH_O, "Find libsumo's functions in its library, given by its path."},
-    {"is_coming_or_going", is_coming_or_going, METH_NOARGS, "Whether a vehicle has entered or left in the last step."},
-    {"in_sight", FAST(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
-    {"columns", FAST(columns), "Return lists as columns; None where they are none of numbers."},
-    {"vehicle_states", vehicle_states, METH_O, "Return what is read of vehicles for observations, to be compared."},
-    {"light_state", light_state, METH_O, "Return what the links of a traffic light show, to be compared."},
-    {"observe", FAST(observe), "Return an observation as bytes."},
-    {"within_reach", FAST(within_reach), "Return the rows of those that an actor may have touched."},
-    {"least_change", FAST(least_change), "Return the least change of speed between two scenes."},
-    {"may_be_near", FAST(may_be_near), "Return who may have a part in the closest approach."},
-    {"tracks", FAST(tracks), "Return the way of an agent, and who was near it."},
-    {"write_array", FAST(write_array), "Write the record of an array; return where it ends."},
-    {"changes_of", FAST(changes_of), "Return where two arrays of words differ, and the changed words."},
-    {"write_step", FAST(write_step), "Write the record of a step; return where it ends."},
+    {"bind", FUNCTION(bind), "Find libsumo's functions in its library, given by its path."},
+    {"is_coming_or_going", FUNCTION(is_coming_or_going), "Whether a vehicle has entered or left in the last step."},
+    {"in_sight", FUNCTION(in_sight), "Return who is near some vehicles, and where these are; None where libsumo refuses."},
+    {"columns", FUNCTION(columns), "Return lists as columns; None where they are none of numbers."},
+    {"vehicle_states", FUNCTION(vehicle_states), "Return what is read of vehicles for observations, to be compared."},
+    {"light_state", FUNCTION(light_state), "Return what the links of a traffic light show, to be compared."},
+    {"observe", FUNCTION(observe), "Return an observation as bytes."},
+    {"within_reach", FUNCTION(within_reach), "Return the rows of those that an actor may have touched."},
+    {"least_change", FUNCTION(least_change), "Return the least change of speed between two scenes."},
+    {"may_be_near", FUNCTION(may_be_near), "Return who may have a part in the closest approach."},
+    {"tracks", FUNCTION(tracks), "Return the way of an agent, and who was near it."},
+    {"changes_of", FUNCTION(changes_of), "Return where two arrays of words differ, and the changed words."},
     {nullptr, nullptr, 0, nullptr},
 };
 
+// Adds a class to the module; Python can make objects of it if it has a constructor. Never given back: columns may
+// outlive the module.
+PyTypeObject *add_class(PyObject *module, const char *name, size_t size, newfunc create, destructor destroy,
+                        PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
+    PyType_Slot slots[] = {
+        {Py_tp_dealloc, reinterpret_cast<void *>(destroy)},
+        {Py_tp_methods, methods},
+        {Py_tp_getset, getters},
+        {Py_tp_doc, const_cast<char *>(about)},
+        {create ? Py_tp_new : 0, reinterpret_cast<void *>(create)},
+        {0, nullptr},
+    };
+    const unsigned flags = Py_TPFLAGS_DEFAULT | (create ? 0 : Py_TPFLAGS_DISALLOW_INSTANTIATION);
+    PyType_Spec spec = {name, static_cast<int>(size), 0, static_cast<unsigned>(flags), slots};
+    PyObject *type = PyType_FromSpec(&spec);
+    if (!type || PyModule_AddObjectRef(module, strrchr(name, '.') + 1, type) < 0) {
+        Py_XDECREF(type);
+        throw Raised();
+    }
+    return reinterpret_cast<PyTypeObject *>(type);
+}
+
+template <typename Object, auto held, auto make>
+PyTypeObject *add_class(PyObject *module, const char *name, PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
+    typedef Class<Object, held, make> Made;
+    return add_class(module, name, sizeof(Object), Made::create, Made::destroy, methods, getters, about);
+}
+
 int fill(PyObject *module) {
-    for (PyType_Spec *spec : {&vehicles_spec, &columns_spec, &usual_spec, &draft_spec, &lane_block_spec,
-                              &streams_spec}) {
-        PyObject *type = PyType_FromSpec(spec);
-        if (!type || PyModule_AddObjectRef(module, strrchr(spec->name, '.') + 1, type) < 0) {
-            Py_XDECREF(type);
-            return -1;
-        }
-        // Never given back: columns may outlive the module.
-        if (spec == &vehicles_spec) {
-            vehicles_type = reinterpret_cast<PyTypeObject *>(type);
-        } else if (spec == &columns_spec) {
-            columns_type = reinterpret_cast<PyTypeObject *>(type);
-        } else if (spec == &lane_block_spec) {
-            lane_block_type = reinterpret_cast<PyTypeObject *>(type);
-        } else if (spec == &streams_spec) {
-            streams_type = reinterpret_cast<PyTypeObject *>(type);
-        } else if (spec == &draft_spec) {
-            draft_type = reinterpret_cast<PyTypeObject *>(type);
-        }
+    try {
+        vehicles_type = add_class<Vehicles, &Vehicles::roster, make_roster>(
+            module, "_crashhunt_core.Vehicles", vehicles_methods, no_getters,
+            "Vehicles of the running simulation, by their ids.");
+        columns_type = add_class(module, "_crashhunt_core.Columns", sizeof(Columns), nullptr, columns_free,
+                                 columns_methods, columns_getters, "Where everybody in a scene is.");
+        add_class<UsualSteps, &UsualSteps::steps, make_steps>(
+            module, "_crashhunt_core.UsualSteps", usual_methods, usual_getters,
+            "Steps of an episode in which nothing happens, each in one call.");
+        draft_type = add_class<Draft, &Draft::observation, make_observation>(
+            module, "_crashhunt_core.Draft", draft_methods, no_getters,
+            "An observation that is being written, part by part.");
+        lane_block_type = add_class<LaneBlock, &LaneBlock::lanes, make_lanes>(
+            module, "_crashhunt_core.LaneBlock", no_methods, no_getters,
+            "The candidates of the lanes around a vehicle.");
+        streams_type = add_class<Streams, &Streams::junction, make_junction>(
+            module, "_crashhunt_core.Streams", no_methods, no_getters,
+            "The streams that conflict with a path across a junction.");
+    } catch (const Raised &) {
+        return -1;
     }
     return PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE);
 }

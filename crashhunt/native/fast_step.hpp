@@ -254,42 +254,37 @@ struct Steps {
 
     // Writes a record and where the process is; false if Python has to do it.
     bool record(int kind, const void *data, size_t length, Phase phase) {
-        Py_buffer buffer;
+        Buffer buffer;
         if (offset + length + 16 > reserved || length > UINT32_MAX) {
             return false;
         }
-        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+        if (!buffer.open(tape, PyBUF_WRITABLE)) {
             PyErr_Clear();
             return false;
         }
-        char *start = static_cast<char *>(buffer.buf);
-        offset = put_record(start, offset, tags[kind], 0, data, length);
-        say_where(start, offset, step, phase, 0);
-        PyBuffer_Release(&buffer);
+        offset = put_record(buffer.bytes(), offset, tags[kind], data, length);
+        say_where(buffer.bytes(), offset, step, phase);
         return true;
     }
 
     bool record_array(int kind, PyObject *given, Phase phase) {
-        Py_buffer array;
-        if (PyObject_GetBuffer(given, &array, PyBUF_C_CONTIGUOUS) < 0) {
+        Buffer array;
+        if (!array.open(given, PyBUF_C_CONTIGUOUS)) {
             PyErr_Clear();
             return false;
         }
-        const bool done = record(kind, array.buf, static_cast<size_t>(array.len), phase);
-        PyBuffer_Release(&array);
-        return done;
+        return record(kind, array.bytes(), array.size(), phase);
     }
 
     // Takes the last record back, which has not been read.
     void forget(size_t end) {
-        Py_buffer buffer;
-        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+        Buffer buffer;
+        if (!buffer.open(tape, PyBUF_WRITABLE)) {
             PyErr_Clear();
             return;
         }
         offset = end;
-        say_where(static_cast<char *>(buffer.buf), offset, step, ACTING, 0);
-        PyBuffer_Release(&buffer);
+        say_where(buffer.bytes(), offset, step, ACTING);
     }
 
     // Which way it drives, where it is asked; false where that may be an event.
@@ -405,7 +400,7 @@ struct Steps {
     }
 
     PyObject *shown_parts(const Scene &present, const Sight &who) const {
-        Observation *whole = draft ? &observation_of(draft) : nullptr;
+        Observation *whole = draft ? &self_of<Observation>(draft) : nullptr;
         const bool written = whole && whole->again(present, who.vehicles, who.row, lane, next.time_s);
         if (PyErr_Occurred()) {
             return nullptr;
@@ -763,18 +758,14 @@ struct Steps {
             record(3, now.lanes.data(), now.lanes.size(), SIMULATING);
         }
         step++;
-        Py_buffer buffer;
-        if (PyObject_GetBuffer(tape, &buffer, PyBUF_WRITABLE) < 0) {
+        Buffer buffer;
+        if (!buffer.open(tape, PyBUF_WRITABLE)) {
             PyErr_Clear(); // it had one a moment ago
             return;
         }
-        char *start = static_cast<char *>(buffer.buf);
-        char *rewards = put_step(start + offset, tags[2], step, now.time_s, 1, now.values);
-        memcpy(rewards, &reward, 8);
         runs.back().places.push_back(offset + 32);
-        offset += 32 + 8 * now.values.size();
-        say_where(start, offset, step, SIMULATING, 0);
-        PyBuffer_Release(&buffer);
+        offset = put_step(buffer.bytes(), offset, tags[2], step, now.time_s, reward, now.values);
+        say_where(buffer.bytes(), offset, step, SIMULATING);
     }
 
     PyObject *go_on(bool quiet) {

@@ -76,15 +76,14 @@ template <typename Function> bool find(void *library, const char *name, Function
     return function != nullptr;
 }
 
-PyObject *bind(PyObject *, PyObject *path) {
-    PyObject *encoded = nullptr;
-    if (!PyUnicode_FSConverter(path, &encoded)) {
-        return nullptr;
+void bind(PyObject *path) {
+    Ref encoded;
+    if (!PyUnicode_FSConverter(path, &encoded.object)) {
+        throw Raised();
     }
-    void *library = dlopen(PyBytes_AS_STRING(encoded), RTLD_LAZY | RTLD_NOLOAD);
-    Py_DECREF(encoded);
+    void *library = dlopen(PyBytes_AS_STRING(encoded.object), RTLD_LAZY | RTLD_NOLOAD);
     if (!library) {
-        return PyErr_Format(PyExc_OSError, "libsumo is not loaded");
+        raise(PyExc_OSError, "libsumo is not loaded");
     }
     Sumo found = {};
     bool whole = find(library, "_ZN7libsumo7Vehicle11getPositionE" STRING "b", found.position) &&
@@ -135,18 +134,16 @@ PyObject *bind(PyObject *, PyObject *path) {
                  find(library, "_ZTV9MSVehicle", found.vehicle_table);
     dlclose(library); // Python keeps it loaded
     if (!whole) {
-        return nullptr;
+        throw Raised();
     }
     found.bound = true;
     sumo = found;
-    Py_RETURN_NONE;
 }
 
-bool unbound() {
+void require_bound() {
     if (!sumo.bound) {
-        PyErr_SetString(PyExc_RuntimeError, "bind has not been called");
+        raise(PyExc_RuntimeError, "bind has not been called");
     }
-    return !sumo.bound;
 }
 
 bool coming_or_going() {
@@ -154,13 +151,7 @@ bool coming_or_going() {
            sumo.unparking();
 }
 
-PyObject *is_coming_or_going(PyObject *, PyObject *) {
-    if (unbound()) {
-        return nullptr;
-    }
-    try {
-        return PyBool_FromLong(coming_or_going());
-    } catch (...) {
-        Py_RETURN_NONE;
-    }
+bool is_coming_or_going() {
+    require_bound();
+    return coming_or_going();
 }

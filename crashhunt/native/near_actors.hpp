@@ -78,20 +78,10 @@ PyObject *observed(const Scene &present, size_t row, size_t shown, double distan
 }
 
 // observe(columns, row, others, distance, from_left, lateral_speed) -> bytes | None
-PyObject *observe(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
-    if (!columns) {
-        return PyErr_Format(PyExc_TypeError, "observe takes columns and five numbers");
-    }
-    const Py_ssize_t row = PyLong_AsSsize_t(given[1]), others = PyLong_AsSsize_t(given[2]);
-    const double distance = PyFloat_AsDouble(given[3]), from_left = PyFloat_AsDouble(given[4]);
-    const double lateral_speed = PyFloat_AsDouble(given[5]);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
+PyObject *observe(Columns *columns, long row, long others, double distance, double from_left, double lateral_speed) {
     const Scene present(columns);
     if (!present.sized() || row < 0 || others < 0 || static_cast<size_t>(row) >= present.size) {
-        Py_RETURN_NONE;
+        return Py_NewRef(Py_None);
     }
     PyObject *bytes = observed(present, static_cast<size_t>(row), static_cast<size_t>(others), distance, from_left,
                                lateral_speed);
@@ -199,61 +189,32 @@ bool reach(const Scene &present, const Scene &previous, size_t row, double step_
 
 std::vector<size_t> reached; // used again
 
-// The earlier row of each row, or -1, as a list; false with an exception where it is none.
-bool read_earlier(PyObject *list, size_t rows, size_t earlier_rows, Earlier &found) {
-    found.clear();
-    if (!PyList_CheckExact(list) || static_cast<size_t>(PyList_GET_SIZE(list)) != rows) {
-        PyErr_SetString(PyExc_TypeError, "earlier rows are a list with a row, or -1, for each row");
-        return false;
+// The earlier row of each row, or -1, of a list.
+Earlier earlier_rows_of(PyObject *list, size_t rows, size_t earlier_rows) {
+    Earlier found = From<Earlier>::of(From<List>::of(list));
+    if (found.size() != rows) {
+        raise(PyExc_TypeError, "earlier rows are a list with a row, or -1, for each row");
     }
-    for (size_t row = 0; row < rows; row++) {
-        const long was = PyLong_AsLong(PyList_GET_ITEM(list, static_cast<Py_ssize_t>(row)));
-        if (was == -1 && PyErr_Occurred()) {
-            return false;
-        }
+    for (long was : found) {
         if (was < -1 || was >= static_cast<long>(earlier_rows)) {
-            PyErr_SetString(PyExc_IndexError, "there is no such earlier row");
-            return false;
-        }
-        found.push_back(was);
-    }
-    return true;
-}
-
-Earlier rows_before; // used again
-
-// within_reach(columns, earlier columns, row, step_s, hardest, earlier rows | None) -> list of rows | None
-PyObject *within_reach(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *columns = count == 6 ? columns_of(given[0]) : nullptr;
-    Columns *earlier = columns ? columns_of(given[1]) : nullptr;
-    if (!earlier) {
-        return PyErr_Format(PyExc_TypeError, "within_reach takes columns twice, three numbers and earlier rows");
-    }
-    const Py_ssize_t asked = PyLong_AsSsize_t(given[2]);
-    const double step_s = PyFloat_AsDouble(given[3]), hardest = PyFloat_AsDouble(given[4]);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    const Scene present(columns), previous(earlier);
-    const size_t row = static_cast<size_t>(asked);
-    rows_before.clear(); // empty where the actors are the same
-    if (given[5] != Py_None && !read_earlier(given[5], present.size, previous.size, rows_before)) {
-        return nullptr;
-    }
-    if ((given[5] == Py_None && previous.size != present.size) || !present.sized() || !previous.sized() || asked < 0 ||
-        row >= present.size || !reach(present, previous, row, step_s, hardest, reached, rows_before)) {
-        Py_RETURN_NONE;
-    }
-    PyObject *found = PyList_New(static_cast<Py_ssize_t>(reached.size()));
-    for (size_t number = 0; found && number < reached.size(); number++) {
-        PyObject *other = PyLong_FromSize_t(reached[number]);
-        if (!other) {
-            Py_CLEAR(found);
-        } else {
-            PyList_SET_ITEM(found, static_cast<Py_ssize_t>(number), other);
+            raise(PyExc_IndexError, "there is no such earlier row");
         }
     }
     return found;
+}
+
+// within_reach(columns, earlier columns, row, step_s, hardest, earlier rows | None) -> list of rows | None
+std::optional<std::vector<size_t>> within_reach(Columns *columns, Columns *earlier, long asked, double step_s,
+                                                double hardest, PyObject *earlier_rows) {
+    const Scene present(columns), previous(earlier);
+    const bool same = earlier_rows == Py_None;
+    const size_t row = static_cast<size_t>(asked);
+    const Earlier rows = same ? Earlier() : earlier_rows_of(earlier_rows, present.size, previous.size);
+    if ((same && previous.size != present.size) || !present.sized() || !previous.sized() || asked < 0 ||
+        row >= present.size || !reach(present, previous, row, step_s, hardest, reached, rows)) {
+        return {};
+    }
+    return reached;
 }
 
 // The least change of speed; 0 if there is no actor, and NaN if Python has to compute it.
@@ -270,15 +231,8 @@ double least_of(const Scene &earlier, const Scene &later) {
 }
 
 // least_change(earlier, later) -> float | None: the least change of speed; 0 if there is no actor
-PyObject *least_change(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Columns *was = count == 2 ? columns_of(given[0]) : nullptr, *is = was ? columns_of(given[1]) : nullptr;
-    if (!is) {
-        return PyErr_Format(PyExc_TypeError, "least_change takes columns twice");
-    }
+std::optional<double> least_change(Columns *was, Columns *is) {
     const Scene earlier(was), later(is);
-    if (earlier.size != later.size) {
-        Py_RETURN_NONE;
-    }
-    const double least = least_of(earlier, later);
-    return std::isnan(least) ? Py_NewRef(Py_None) : PyFloat_FromDouble(least);
+    const double least = earlier.size == later.size ? least_of(earlier, later) : NAN;
+    return std::isnan(least) ? std::nullopt : std::optional(least);
 }

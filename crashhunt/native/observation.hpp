@@ -8,29 +8,18 @@ const double NO_VALUE = -1073741824.0; // of libsumo's getters
 double known_value(double value) { return value == NO_VALUE ? 0.0 : value; }
 
 // A view of a float64 array, or of one of NumPy's indices, that stays valid as long as it is held.
-struct Held {
-    Py_buffer buffer = {};
-    Held() = default;
-    Held(const Held &) = delete;
-    ~Held() {
-        if (buffer.obj) {
-            PyBuffer_Release(&buffer);
+struct Held : Buffer {
+    void hold(PyObject *array) {
+        if (!open(array, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)) {
+            throw Raised();
+        }
+        if (view.itemsize != 8) {
+            raise(PyExc_TypeError, "these are no numbers of 8 bytes");
         }
     }
-    bool hold(PyObject *array) {
-        if (PyObject_GetBuffer(array, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
-            return false;
-        }
-        if (buffer.itemsize != 8) {
-            PyErr_SetString(PyExc_TypeError, "these are no numbers of 8 bytes");
-            return false;
-        }
-        return true;
-    }
-    size_t count() const { return static_cast<size_t>(buffer.len) / 8; }
-    size_t length(int axis) const { return axis < buffer.ndim ? static_cast<size_t>(buffer.shape[axis]) : 0; }
-    const double *numbers() const { return static_cast<const double *>(buffer.buf); }
-    const int64_t *whole() const { return static_cast<const int64_t *>(buffer.buf); }
+    size_t count() const { return size() / 8; }
+    size_t length(int axis) const { return axis < view.ndim ? static_cast<size_t>(view.shape[axis]) : 0; }
+    const double *numbers() const { return static_cast<const double *>(view.buf); }
 };
 
 // The candidates of the lanes around a vehicle, as _Block of sumo/_road_readers.py, with the rows where they are.
@@ -50,17 +39,15 @@ PyTypeObject *lane_block_type = nullptr;
 const size_t LANE_COLUMNS = 6; // of a row of a LanePath, which has one more
 
 // The points among which the nearest one is while the vehicle is in the square; as _block_of.
-bool set_window(CandidateLane &lane, PyObject *rows, PyObject *places, int64_t start, int64_t last, const Lanes &lanes,
-                int64_t window) {
+void set_window(CandidateLane &lane, PyObject *path, const Lanes &lanes, int64_t window) {
+    const auto [rows, places, start, last] = From<std::tuple<PyObject *, PyObject *, int64_t, int64_t>>::of(path);
     Held points;
-    if (!lane.rows.hold(rows) || !points.hold(places)) {
-        return false;
-    }
+    lane.rows.hold(rows);
+    points.hold(places);
     lane.count = static_cast<int64_t>(lane.rows.length(0));
     if (lane.rows.length(1) != LANE_COLUMNS + 1 || points.length(0) != 2 || points.length(1) != lane.rows.length(0) ||
         start < 0 || last < start || last >= lane.count || window < 1) {
-        PyErr_SetString(PyExc_ValueError, "these are not the points of a lane");
-        return false;
+        raise(PyExc_ValueError, "these are not the points of a lane");
     }
     const double *x = points.numbers(), *y = x + lane.count;
     int64_t nearest = start;
@@ -81,38 +68,20 @@ bool set_window(CandidateLane &lane, PyObject *rows, PyObject *places, int64_t s
         to_y[point] = y[static_cast<size_t>(lane.begin) + point] - lanes.middle_y;
         squared[point] = to_x[point] * to_x[point] + to_y[point] * to_y[point];
     }
-    return true;
 }
 
 // LaneBlock([(rows, places, start, last) | None], middle_x, middle_y, window)
-PyObject *lane_block_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *paths, *rows, *places;
-    double middle_x, middle_y;
-    Py_ssize_t window, start, last;
-    if (!PyArg_ParseTuple(arguments, "O!ddn", &PyList_Type, &paths, &middle_x, &middle_y, &window)) {
-        return nullptr;
-    }
-    LaneBlock *self = reinterpret_cast<LaneBlock *>(type->tp_alloc(type, 0));
-    if (!self) {
-        return nullptr;
-    }
-    Lanes &lanes = *(self->lanes = new Lanes());
-    lanes.middle_x = middle_x;
-    lanes.middle_y = middle_y;
-    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(paths); number++) {
-        PyObject *path = PyList_GET_ITEM(paths, number);
-        CandidateLane &lane = (lanes.lanes.emplace_back(), lanes.lanes.back());
-        if (path != Py_None && (!PyTuple_CheckExact(path) ||
-                                !PyArg_ParseTuple(path, "OOnn", &rows, &places, &start, &last) ||
-                                !set_window(lane, rows, places, start, last, lanes, window))) {
-            if (!PyErr_Occurred()) {
-                PyErr_SetString(PyExc_TypeError, "a candidate is a tuple or None");
-            }
-            Py_DECREF(self);
-            return nullptr;
+std::unique_ptr<Lanes> make_lanes(List paths, double middle_x, double middle_y, int64_t window) {
+    auto lanes = std::make_unique<Lanes>();
+    lanes->middle_x = middle_x;
+    lanes->middle_y = middle_y;
+    for (PyObject *path : From<std::vector<PyObject *>>::of(paths)) {
+        CandidateLane &lane = lanes->lanes.emplace_back();
+        if (path != Py_None) {
+            set_window(lane, path, *lanes, window);
         }
     }
-    return reinterpret_cast<PyObject *>(self);
+    return lanes;
 }
 
 // An object of Python that stays as long as it is held.
@@ -234,38 +203,21 @@ struct Draft {
 };
 PyTypeObject *draft_type = nullptr;
 
-Observation &observation_of(PyObject *draft) { return *reinterpret_cast<Draft *>(draft)->observation; }
+template <> Observation &self_of<Observation>(PyObject *draft) { return *reinterpret_cast<Draft *>(draft)->observation; }
 
 // Draft(agent, size)
-PyObject *draft_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *name;
-    Py_ssize_t size;
-    std::string agent;
-    if (!PyArg_ParseTuple(arguments, "Un", &name, &size) || size < 0 || !encode_name(name, agent)) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_ValueError, "a draft of %zd values", size);
-    }
-    Draft *self = reinterpret_cast<Draft *>(type->tp_alloc(type, 0));
-    if (self) {
-        self->observation = new Observation();
-        self->observation->size = static_cast<size_t>(size);
-        self->observation->agent = agent;
-    }
-    return reinterpret_cast<PyObject *>(self);
+std::unique_ptr<Observation> make_observation(std::string agent, size_t size) {
+    auto whole = std::make_unique<Observation>();
+    whole->agent = agent;
+    whole->size = size;
+    return whole;
 }
 
 // begin(columns | None, row, lane, time_s)
-PyObject *draft_begin(PyObject *draft, PyObject *arguments) {
-    Observation &whole = observation_of(draft);
-    PyObject *columns;
-    Py_ssize_t row;
-    const char *lane;
-    double time_s;
-    if (!PyArg_ParseTuple(arguments, "Onsd", &columns, &row, &lane, &time_s) ||
-        (columns != Py_None && !columns_of(columns)) || unbound()) {
-        return nullptr;
-    }
+void draft_begin(Observation &whole, PyObject *columns, long row, std::string lane, double time_s) {
+    require_bound();
     if (std::exchange(whole.going_on, false) && columns == reinterpret_cast<PyObject *>(whole.columns)) {
-        Py_RETURN_NONE;
+        return;
     }
     whole.parts.clear();
     whole.usable = whole.rest = false;
@@ -273,71 +225,46 @@ PyObject *draft_begin(PyObject *draft, PyObject *arguments) {
     Py_CLEAR(whole.bytes);
     Py_CLEAR(whole.columns);
     if (columns == Py_None) {
-        Py_RETURN_NONE;
+        return;
     }
-    const Scene scene(reinterpret_cast<Columns *>(columns));
+    const Scene scene(From<Columns *>::of(columns));
     if (!scene.sized() || row < 0 || static_cast<size_t>(row) >= scene.size) {
-        Py_RETURN_NONE;
+        return;
     }
-    try {
-        whole.number = sumo.route_index(whole.agent);
-        whole.route = sumo.route(whole.agent);
-        whole.along = sumo.along(whole.agent);
-    } catch (...) { // such as an actor of a recording that is played back
-        Py_RETURN_NONE;
-    }
+    // These raise for an actor of a recording that is played back.
+    whole.number = sumo.route_index(whole.agent);
+    whole.route = sumo.route(whole.agent);
+    whole.along = sumo.along(whole.agent);
     whole.lane = lane;
     whole.columns = reinterpret_cast<Columns *>(Py_NewRef(columns));
     whole.enter(whole.columns->vehicles, static_cast<size_t>(row));
     whole.usable = whole.along >= 0 && scene.roster->ids.size() == scene.size; // without persons
-    Py_RETURN_NONE;
 }
 
 // has(place) -> whether the part there is written
-PyObject *draft_has(PyObject *draft, PyObject *given) {
-    const size_t place = PyLong_AsSize_t(given);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    const auto &parts = observation_of(draft).parts;
-    return PyBool_FromLong(
-        std::any_of(parts.begin(), parts.end(), [place](const auto &part) { return part->place == place; }));
+bool draft_has(Observation &whole, size_t place) {
+    return std::any_of(whole.parts.begin(), whole.parts.end(), [place](const auto &part) { return part->place == place; });
 }
 
 // enter(vehicles, row): who is in sight from now on
-PyObject *draft_enter(PyObject *draft, PyObject *arguments) {
-    PyObject *vehicles;
-    Py_ssize_t row;
-    if (!PyArg_ParseTuple(arguments, "On", &vehicles, &row) || !vehicles_of(vehicles)) {
-        return nullptr;
-    }
-    observation_of(draft).enter(reinterpret_cast<Vehicles *>(vehicles), static_cast<size_t>(row));
-    Py_RETURN_NONE;
-}
+void draft_enter(Observation &whole, Vehicles *vehicles, size_t row) { whole.enter(vehicles, row); }
 
-// Where a part begins; null with an exception where it does not fit.
-double *part_at(PyObject *draft, Py_ssize_t place, size_t size) {
-    Observation &whole = observation_of(draft);
-    if (place < 0 || static_cast<size_t>(place) > whole.size || size > whole.size - static_cast<size_t>(place)) {
-        PyErr_SetString(PyExc_ValueError, "a part is written beyond the end");
-        return nullptr;
+// Where a part begins.
+double *part_at(Observation &whole, size_t place, size_t size) {
+    if (place > whole.size || size > whole.size - place) {
+        raise(PyExc_ValueError, "a part is written beyond the end");
     }
     double *values = whole.values();
-    return values ? values + place : nullptr;
+    return values ? values + place : throw Raised();
 }
 
 // Writes a part and keeps it; returns whether that could be done.
-PyObject *write_part(PyObject *draft, PyObject *place, std::unique_ptr<Written> part) {
-    Observation &whole = observation_of(draft);
-    const Py_ssize_t begin = PyLong_AsSsize_t(place);
-    double *out = PyErr_Occurred() ? nullptr : part_at(draft, begin, part->size());
-    if (!out) {
-        return nullptr;
-    }
+bool write_part(Observation &whole, size_t place, std::unique_ptr<Written> part) {
+    double *out = part_at(whole, place, part->size());
     if (!whole.columns) {
-        Py_RETURN_FALSE;
+        return false;
     }
-    part->place = static_cast<size_t>(begin);
+    part->place = place;
     const Scene scene(whole.columns);
     const Here here(scene, whole.row, whole.time_s, whole.along);
     bool done = false;
@@ -346,51 +273,32 @@ PyObject *write_part(PyObject *draft, PyObject *place, std::unique_ptr<Written> 
     } catch (...) { // such as an actor of a recording that is played back
     }
     if (PyErr_Occurred()) {
-        return nullptr;
+        throw Raised();
     }
     if (done) {
         whole.parts.push_back(std::move(part));
     } else {
         std::fill(out, out + part->size(), 0.0);
     }
-    return PyBool_FromLong(done);
+    return done;
 }
 
 // put(place, tuple of numbers)
-PyObject *draft_put(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    if (count != 2 || !PyTuple_CheckExact(given[1])) {
-        return PyErr_Format(PyExc_TypeError, "put takes a place and a tuple");
-    }
-    const Py_ssize_t place = PyLong_AsSsize_t(given[0]), size = PyTuple_GET_SIZE(given[1]);
-    double *out = PyErr_Occurred() ? nullptr : part_at(draft, place, static_cast<size_t>(size));
-    for (Py_ssize_t number = 0; out && number < size; number++) {
-        out[number] = PyFloat_AsDouble(PyTuple_GET_ITEM(given[1], number));
-        if (out[number] == -1.0 && PyErr_Occurred()) {
-            return nullptr;
-        }
-    }
-    observation_of(draft).rest = true;
-    return out ? Py_NewRef(Py_None) : nullptr;
+void draft_put(Observation &whole, size_t place, std::vector<double> values) {
+    std::copy(values.begin(), values.end(), part_at(whole, place, values.size()));
+    whole.rest = true;
 }
 
 // put_array(place, array of float64)
-PyObject *draft_put_array(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
+void draft_put_array(Observation &whole, size_t place, PyObject *given) {
     Held array;
-    const Py_ssize_t place = count == 2 ? PyLong_AsSsize_t(given[0]) : -1;
-    if (PyErr_Occurred() || count != 2 || !array.hold(given[1])) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "put_array takes a place and an array");
-    }
-    double *out = part_at(draft, place, array.count());
-    if (!out) {
-        return nullptr;
-    }
-    memcpy(out, array.buffer.buf, static_cast<size_t>(array.buffer.len));
-    observation_of(draft).rest = true;
-    Py_RETURN_NONE;
+    array.hold(given);
+    memcpy(part_at(whole, place, array.count()), array.view.buf, array.size());
+    whole.rest = true;
 }
 
 // take() -> bytes: the values, which are 0 from then on
-PyObject *draft_take(PyObject *draft, PyObject *) { return observation_of(draft).take(); }
+Ref draft_take(Observation &whole) { return Ref(whole.take()); }
 
 const double WHEELBASE_SHARE = 0.6, MOST_BEND = 2.0; // as in simulators
 

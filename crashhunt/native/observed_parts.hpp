@@ -37,16 +37,11 @@ struct Ego : Written {
 };
 
 // ego(place, [heading, speed], (start_m, start_s, step_s, lane_index)) -> whether it could be written
-PyObject *draft_ego(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    if (count != 3 || !PyList_CheckExact(given[1]) || !PyTuple_CheckExact(given[2])) {
-        return PyErr_Format(PyExc_TypeError, "ego takes a place, a list and a tuple");
-    }
-    auto part = std::make_unique<Ego>(given[1]);
-    part->agent = observation_of(draft).agent;
-    if (!PyArg_ParseTuple(given[2], "dddd", &part->start_m, &part->start_s, &part->step_s, &part->lane_index)) {
-        return nullptr;
-    }
-    return write_part(draft, given[0], std::move(part));
+bool draft_ego(Observation &whole, size_t place, List last, std::tuple<double, double, double, double> facts) {
+    auto part = std::make_unique<Ego>(last);
+    part->agent = whole.agent;
+    std::tie(part->start_m, part->start_s, part->step_s, part->lane_index) = facts;
+    return write_part(whole, place, std::move(part));
 }
 
 struct Seen {
@@ -89,8 +84,10 @@ struct Actors : Written {
     std::vector<Seen> found;
     std::unordered_map<std::string, bool> on_path[2]; // whether a lane is on the path of the vehicle, ahead and behind
 
-    Actors(PyObject *who[2], PyObject *state[2], PyObject *path[2])
-        : kinds(who[0]), ids(who[1]), speeds(state[0]), rows(state[1]), lanes(path[0]), ask(path[1]) {}
+    Actors(const std::tuple<List, List> &who, const std::tuple<Dict, List> &state,
+           const std::tuple<Exact<&PyFrozenSet_Type>, PyObject *> &path)
+        : kinds(std::get<0>(who)), ids(std::get<1>(who)), speeds(std::get<0>(state)), rows(std::get<1>(state)),
+          lanes(std::get<0>(path)), ask(std::get<1>(path)) {}
     size_t size() const override { return WIDTH * limit; }
 
     bool write(const Here &here, double *out) override {
@@ -169,23 +166,11 @@ struct Actors : Written {
 
 // actors(place, (kinds, ids), (radius, limit, step_s), (last speeds, rows), (lanes, ask)) ->
 //     whether it could be written
-PyObject *draft_actors(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    PyObject *who[2], *state[2], *path[2];
-    double radius, step_s;
-    Py_ssize_t limit;
-    if (count != 5 || !PyTuple_CheckExact(given[1]) || !PyTuple_CheckExact(given[2]) || !PyTuple_CheckExact(given[3]) ||
-        !PyTuple_CheckExact(given[4]) ||
-        !PyArg_ParseTuple(given[1], "O!O!", &PyList_Type, who, &PyList_Type, who + 1) ||
-        !PyArg_ParseTuple(given[2], "dnd", &radius, &limit, &step_s) ||
-        !PyArg_ParseTuple(given[3], "O!O!", &PyDict_Type, state, &PyList_Type, state + 1) ||
-        !PyArg_ParseTuple(given[4], "O!O", &PyFrozenSet_Type, path, path + 1) || limit < 0) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "these are not the facts of actors");
-    }
+bool draft_actors(Observation &whole, size_t place, std::tuple<List, List> who, std::tuple<double, size_t, double> limits,
+                  std::tuple<Dict, List> state, std::tuple<Exact<&PyFrozenSet_Type>, PyObject *> path) {
     auto part = std::make_unique<Actors>(who, state, path);
-    part->radius = radius;
-    part->limit = static_cast<size_t>(limit);
-    part->step_s = step_s;
-    return write_part(draft, given[0], std::move(part));
+    std::tie(part->radius, part->limit, part->step_s) = limits;
+    return write_part(whole, place, std::move(part));
 }
 
 std::vector<double> distances; // used again
@@ -274,19 +259,14 @@ struct NearLanes : Written {
 };
 
 // lanes(place, ask, (number of lanes, points, before, stride, near_m, square_m)) -> whether it could be written
-PyObject *draft_lanes(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    if (count != 3 || !PyTuple_CheckExact(given[2])) {
-        return PyErr_Format(PyExc_TypeError, "lanes takes a place, a function and a tuple");
-    }
-    auto part = std::make_unique<NearLanes>(given[1]);
-    if (!PyArg_ParseTuple(given[2], "nnnndd", &part->wanted, &part->points, &part->before, &part->stride, &part->near_m,
-                          &part->square_m)) {
-        return nullptr;
-    }
+bool draft_lanes(Observation &whole, size_t place, PyObject *ask,
+                 std::tuple<Py_ssize_t, Py_ssize_t, Py_ssize_t, Py_ssize_t, double, double> shape) {
+    auto part = std::make_unique<NearLanes>(ask);
+    std::tie(part->wanted, part->points, part->before, part->stride, part->near_m, part->square_m) = shape;
     if (part->wanted < 0 || part->points < 0) {
-        return PyErr_Format(PyExc_ValueError, "there are no such lanes");
+        raise(PyExc_ValueError, "there are no such lanes");
     }
-    return write_part(draft, given[0], std::move(part));
+    return write_part(whole, place, std::move(part));
 }
 
 struct Route : Written {
@@ -322,18 +302,16 @@ struct Route : Written {
 };
 
 // route(place, rows of a path, (begin, last, points, stride)) -> whether it could be written
-PyObject *draft_route(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
+bool draft_route(Observation &whole, size_t place, PyObject *rows,
+                 std::tuple<Py_ssize_t, Py_ssize_t, Py_ssize_t, Py_ssize_t> window) {
     auto part = std::make_unique<Route>();
-    if (count != 3 || !PyTuple_CheckExact(given[2]) ||
-        !PyArg_ParseTuple(given[2], "nnnn", &part->begin, &part->last, &part->points, &part->stride) ||
-        !part->held.hold(given[1])) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "these are not the points of a path");
-    }
+    std::tie(part->begin, part->last, part->points, part->stride) = window;
+    part->held.hold(rows);
     if (part->begin < 0 || part->last < part->begin || static_cast<size_t>(part->last) >= part->held.length(0) ||
         part->held.length(1) != Route::ROW || part->points < 0 || part->stride < 1) {
-        return PyErr_Format(PyExc_ValueError, "these are not the points of a path");
+        raise(PyExc_ValueError, "these are not the points of a path");
     }
-    return write_part(draft, given[0], std::move(part));
+    return write_part(whole, place, std::move(part));
 }
 
 struct Signals : Written {
@@ -405,36 +383,32 @@ struct Signals : Written {
 };
 
 // signals(place, [(distance, light, link, [state, since])], step_s) -> whether it could be written
-PyObject *draft_signals(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
+bool draft_signals(Observation &whole, size_t place, std::vector<std::tuple<double, std::string, size_t, List>> lights,
+                   double step_s) {
     auto part = std::make_unique<Signals>();
-    part->step_s = count == 3 ? PyFloat_AsDouble(given[2]) : 0.0;
-    if (count != 3 || !PyList_CheckExact(given[1]) || PyErr_Occurred()) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "signals takes a place, a list and a time");
-    }
-    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(given[1]); number++) {
-        PyObject *name, *state;
-        double distance;
-        Py_ssize_t link;
-        std::string id;
-        if (!PyArg_ParseTuple(PyList_GET_ITEM(given[1], number), "dUnO!", &distance, &name, &link, &PyList_Type,
-                              &state) ||
-            !encode_name(name, id)) {
-            return nullptr;
+    part->step_s = step_s;
+    for (const auto &[distance, light, link, state] : lights) {
+        if (PyList_GET_SIZE(state.object) != 2) {
+            raise(PyExc_ValueError, "these are not the facts of a light");
         }
-        if (PyList_GET_SIZE(state) != 2 || link < 0) {
-            return PyErr_Format(PyExc_ValueError, "these are not the facts of a light");
-        }
-        part->lights.emplace_back(id, static_cast<size_t>(link), distance, state);
+        part->lights.emplace_back(light, link, distance, state);
     }
-    return write_part(draft, given[0], std::move(part));
+    return write_part(whole, place, std::move(part));
 }
 
 // Who takes the streams that conflict with a path across a junction, as _taken of RightOfWayReader.
 struct Stream {
-    int must_yield;
+    bool must_yield;
     double begin, end, other_begin, other_end, offset;
     std::string light; // that of the stream, without which nothing takes its priority away
     Py_ssize_t link;
+};
+template <> struct From<Stream> {
+    static Stream of(PyObject *given) {
+        const auto [must_yield, begin, end, other_begin, other_end, offset, light, link] =
+            From<std::tuple<bool, double, double, double, double, double, std::string, Py_ssize_t>>::of(given);
+        return {must_yield, begin, end, other_begin, other_end, offset, light, link};
+    }
 };
 struct Junction {
     std::unordered_set<std::string> lanes;
@@ -451,21 +425,12 @@ struct Junction {
         if (known != taken.end()) {
             return &known->second;
         }
-        PyObject *list =
-            PyObject_CallFunction(ask.object, "NNiN", text_of(name), text_of(lane), number, text_of(route));
-        std::vector<Stream> found;
-        for (Py_ssize_t row = 0; list && PyList_CheckExact(list) && row < PyList_GET_SIZE(list); row++) {
-            Stream one;
-            PyObject *light;
-            if (!PyArg_ParseTuple(PyList_GET_ITEM(list, row), "pdddddUn", &one.must_yield, &one.begin, &one.end,
-                                  &one.other_begin, &one.other_end, &one.offset, &light, &one.link) ||
-                !encode_name(light, one.light)) {
-                break;
-            }
-            found.push_back(one);
+        const Ref list(PyObject_CallFunction(ask.object, "NNiN", text_of(name), text_of(lane), number, text_of(route)));
+        try {
+            return list ? &(taken[key] = From<std::vector<Stream>>::of(list.object)) : nullptr;
+        } catch (const Raised &) {
+            return nullptr;
         }
-        Py_XDECREF(list);
-        return PyErr_Occurred() ? nullptr : &(taken[key] = found);
     }
 };
 struct Streams {
@@ -474,25 +439,10 @@ struct Streams {
 PyTypeObject *streams_type = nullptr;
 
 // Streams(lanes, ask)
-PyObject *streams_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *lanes, *ask;
-    if (!PyArg_ParseTuple(arguments, "O!O", &PyTuple_Type, &lanes, &ask)) {
-        return nullptr;
-    }
-    Streams *self = reinterpret_cast<Streams *>(type->tp_alloc(type, 0));
-    if (!self) {
-        return nullptr;
-    }
-    self->junction = new Junction(ask);
-    for (Py_ssize_t number = 0; number < PyTuple_GET_SIZE(lanes); number++) {
-        std::string lane;
-        if (!PyUnicode_Check(PyTuple_GET_ITEM(lanes, number)) || !encode_name(PyTuple_GET_ITEM(lanes, number), lane)) {
-            Py_DECREF(self);
-            return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "lanes have names");
-        }
-        self->junction->lanes.insert(lane);
-    }
-    return reinterpret_cast<PyObject *>(self);
+std::unique_ptr<Junction> make_junction(std::vector<std::string> lanes, PyObject *ask) {
+    auto junction = std::make_unique<Junction>(ask);
+    junction->lanes.insert(lanes.begin(), lanes.end());
+    return junction;
 }
 
 struct RightOfWay : Written {
@@ -500,11 +450,11 @@ struct RightOfWay : Written {
     Kept streams;
     Junction &junction;
     double line_m = 0, stop_sign = 0; // where the stop line is on the lane
-    Py_ssize_t limit = 0;
+    size_t limit = 0;
 
     explicit RightOfWay(PyObject *given)
         : streams(given), junction(*reinterpret_cast<Streams *>(given)->junction) {}
-    size_t size() const override { return static_cast<size_t>(limit) * WIDTH; }
+    size_t size() const override { return limit * WIDTH; }
 
     // Whether an actor that has priority by the rules also has it in this moment.
     static bool goes_first(const Stream &stream, double place_m) {
@@ -556,7 +506,7 @@ struct RightOfWay : Written {
             }
         }
         std::sort(rows.begin(), rows.end());
-        rows.resize(std::min(rows.size(), static_cast<size_t>(limit)));
+        rows.resize(std::min(rows.size(), limit));
         for (const auto &[arrival, away, name, must_yield, distance, speed] : rows) {
             for (double value : {1.0, must_yield ? 1.0 : 0.0, line, distance, away, speed, arrival, stop_sign}) {
                 *out++ = value;
@@ -567,51 +517,30 @@ struct RightOfWay : Written {
 };
 
 // right_of_way(place, streams, (line_m, stop_sign, limit)) -> whether it could be written
-PyObject *draft_right_of_way(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    if (count != 3 || Py_TYPE(given[1]) != streams_type || !PyTuple_CheckExact(given[2])) {
-        return PyErr_Format(PyExc_TypeError, "right_of_way takes a place, streams and a tuple");
+bool draft_right_of_way(Observation &whole, size_t place, PyObject *streams, std::tuple<double, double, size_t> facts) {
+    if (Py_TYPE(streams) != streams_type) {
+        raise(PyExc_TypeError, "these are no streams of the core");
     }
-    auto part = std::make_unique<RightOfWay>(given[1]);
-    if (!PyArg_ParseTuple(given[2], "ddn", &part->line_m, &part->stop_sign, &part->limit)) {
-        return nullptr;
-    }
-    return part->limit < 0 ? PyErr_Format(PyExc_ValueError, "there are no such rows")
-                           : write_part(draft, given[0], std::move(part));
+    auto part = std::make_unique<RightOfWay>(streams);
+    std::tie(part->line_m, part->stop_sign, part->limit) = facts;
+    return write_part(whole, place, std::move(part));
 }
 
-// states(vehicles) -> what libsumo says of them by the functions that are used here alone; None where it refuses
-PyObject *vehicle_states(PyObject *, PyObject *given) {
-    Vehicles *vehicles = vehicles_of(given);
-    if (!vehicles || unbound()) {
-        return nullptr;
-    }
-    PyObject *found = PyList_New(0);
-    try {
-        for (const std::string &name : vehicles->roster->ids) {
-            PyObject *state = found ? Py_BuildValue("(NddiidN)", text_of(sumo.lane(name)), sumo.aside(name),
-                                                    sumo.acceleration(name), sumo.signals(name),
-                                                    sumo.route_index(name), sumo.along(name), text_of(sumo.route(name)))
-                                    : nullptr;
-            if (!state || PyList_Append(found, state) < 0) {
-                Py_CLEAR(found);
-            }
-            Py_XDECREF(state);
-        }
-    } catch (...) {
-        Py_XDECREF(found);
-        Py_RETURN_NONE;
+// vehicle_states(vehicles) -> what libsumo says of them by the functions that are used here alone; None where it refuses
+std::vector<std::tuple<std::string, double, double, int, int, double, std::string>> vehicle_states(Vehicles *vehicles) {
+    require_bound();
+    std::vector<std::tuple<std::string, double, double, int, int, double, std::string>> found;
+    for (const std::string &name : vehicles->roster->ids) {
+        found.emplace_back(sumo.lane(name), sumo.aside(name), sumo.acceleration(name), sumo.signals(name),
+                           sumo.route_index(name), sumo.along(name), sumo.route(name));
     }
     return found;
 }
 
 // Columns of which some grow by as much as the vehicle drives along its lane, or shrink.
 struct Along : Written {
-    struct Column {
-        Py_ssize_t index;
-        double from, offset, least;
-    };
     std::vector<double> values;
-    std::vector<Column> columns;
+    std::vector<std::tuple<size_t, double, double, double>> columns; // index, from, offset and least
 
     size_t size() const override { return values.size(); }
 
@@ -620,34 +549,25 @@ struct Along : Written {
             return false;
         }
         std::copy(values.begin(), values.end(), out);
-        for (const Column &one : columns) {
-            out[one.index] = std::max(one.least, one.from + (-here.along + one.offset));
+        for (const auto &[index, from, offset, least] : columns) {
+            out[index] = std::max(least, from + (-here.along + offset));
         }
         return true;
     }
 };
 
 // along(place, values, [(index, from, offset, least)]) -> whether it could be written
-PyObject *draft_along(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
+bool draft_along(Observation &whole, size_t place, std::vector<double> values,
+                 std::vector<std::tuple<size_t, double, double, double>> columns) {
     auto part = std::make_unique<Along>();
-    if (count != 3 || !PyTuple_CheckExact(given[1]) || !PyList_CheckExact(given[2])) {
-        return PyErr_Format(PyExc_TypeError, "along takes a place, a tuple and a list");
-    }
-    for (Py_ssize_t number = 0; number < PyTuple_GET_SIZE(given[1]); number++) {
-        part->values.push_back(PyFloat_AsDouble(PyTuple_GET_ITEM(given[1], number)));
-    }
-    for (Py_ssize_t number = 0; number < PyList_GET_SIZE(given[2]); number++) {
-        Along::Column one;
-        if (!PyArg_ParseTuple(PyList_GET_ITEM(given[2], number), "nddd", &one.index, &one.from, &one.offset,
-                              &one.least)) {
-            return nullptr;
+    for (const auto &one : columns) {
+        if (std::get<0>(one) >= values.size()) {
+            raise(PyExc_IndexError, "there is no such column");
         }
-        if (one.index < 0 || one.index >= PyTuple_GET_SIZE(given[1])) {
-            return PyErr_Format(PyExc_IndexError, "there is no such column");
-        }
-        part->columns.push_back(one);
     }
-    return PyErr_Occurred() ? nullptr : write_part(draft, given[0], std::move(part));
+    part->values = values;
+    part->columns = columns;
+    return write_part(whole, place, std::move(part));
 }
 
 struct SpeedLimit : Written {
@@ -662,64 +582,32 @@ struct SpeedLimit : Written {
 };
 
 // speed_limit(place) -> whether it could be written
-PyObject *draft_speed_limit(PyObject *draft, PyObject *const *given, Py_ssize_t count) {
-    if (count != 1) {
-        return PyErr_Format(PyExc_TypeError, "speed_limit takes a place");
-    }
+bool draft_speed_limit(Observation &whole, size_t place) {
     auto part = std::make_unique<SpeedLimit>();
-    part->lane = observation_of(draft).lane;
-    return write_part(draft, given[0], std::move(part));
+    part->lane = whole.lane;
+    return write_part(whole, place, std::move(part));
 }
 
 // light_state(traffic light) -> what its links show; None where libsumo refuses
-PyObject *light_state(PyObject *, PyObject *name) {
-    std::string id;
-    if (!PyUnicode_Check(name) || !encode_name(name, id) || unbound()) {
-        return PyErr_Occurred() ? nullptr : PyErr_Format(PyExc_TypeError, "a traffic light has a name");
-    }
-    try {
-        return text_of(sumo.light(id));
-    } catch (...) {
-        Py_RETURN_NONE;
-    }
+std::string light_state(std::string light) {
+    require_bound();
+    return sumo.light(light);
 }
 
 PyMethodDef draft_methods[] = {
-    {"begin", draft_begin, METH_VARARGS, "Begin the observation of a step."},
-    {"has", draft_has, METH_O, "Whether a part is written already."},
-    {"enter", draft_enter, METH_VARARGS, "Take who is in sight from now on."},
-    {"put", FAST(draft_put), "Write numbers."},
-    {"put_array", FAST(draft_put_array), "Write an array."},
-    {"ego", FAST(draft_ego), "Write the part ego; return whether it could be done, as the others here do."},
-    {"actors", FAST(draft_actors), "Write the part actors."},
-    {"lanes", FAST(draft_lanes), "Write the part lanes."},
-    {"route", FAST(draft_route), "Write the part route."},
-    {"signals", FAST(draft_signals), "Write the part signals."},
-    {"right_of_way", FAST(draft_right_of_way), "Write the part right_of_way."},
-    {"along", FAST(draft_along), "Write numbers of which some depend on the position on the lane."},
-    {"speed_limit", FAST(draft_speed_limit), "Write the part speed_limit."},
-    {"take", draft_take, METH_NOARGS, "Return what has been written as bytes, and begin again."},
+    {"begin", METHOD(draft_begin), "Begin the observation of a step."},
+    {"has", METHOD(draft_has), "Whether a part is written already."},
+    {"enter", METHOD(draft_enter), "Take who is in sight from now on."},
+    {"put", METHOD(draft_put), "Write numbers."},
+    {"put_array", METHOD(draft_put_array), "Write an array."},
+    {"ego", METHOD(draft_ego), "Write the part ego; return whether it could be done, as the others here do."},
+    {"actors", METHOD(draft_actors), "Write the part actors."},
+    {"lanes", METHOD(draft_lanes), "Write the part lanes."},
+    {"route", METHOD(draft_route), "Write the part route."},
+    {"signals", METHOD(draft_signals), "Write the part signals."},
+    {"right_of_way", METHOD(draft_right_of_way), "Write the part right_of_way."},
+    {"along", METHOD(draft_along), "Write numbers of which some depend on the position on the lane."},
+    {"speed_limit", METHOD(draft_speed_limit), "Write the part speed_limit."},
+    {"take", METHOD(draft_take), "Return what has been written as bytes, and begin again."},
     {nullptr, nullptr, 0, nullptr},
 };
-PyType_Slot draft_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(draft_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<Draft, &Draft::observation>)},
-    {Py_tp_methods, draft_methods},
-    {Py_tp_doc, const_cast<char *>("An observation that is being written, part by part.")},
-    {0, nullptr},
-};
-PyType_Spec draft_spec = {"_crashhunt_core.Draft", sizeof(Draft), 0, Py_TPFLAGS_DEFAULT, draft_slots};
-PyType_Slot lane_block_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(lane_block_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<LaneBlock, &LaneBlock::lanes>)},
-    {Py_tp_doc, const_cast<char *>("The candidates of the lanes around a vehicle.")},
-    {0, nullptr},
-};
-PyType_Spec lane_block_spec = {"_crashhunt_core.LaneBlock", sizeof(LaneBlock), 0, Py_TPFLAGS_DEFAULT, lane_block_slots};
-PyType_Slot streams_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(streams_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(free_object<Streams, &Streams::junction>)},
-    {Py_tp_doc, const_cast<char *>("The streams that conflict with a path across a junction.")},
-    {0, nullptr},
-};
-PyType_Spec streams_spec = {"_crashhunt_core.Streams", sizeof(Streams), 0, Py_TPFLAGS_DEFAULT, streams_slots};

@@ -17,28 +17,6 @@ bool numbers_of(PyObject *list, std::vector<double> &values) {
     return true;
 }
 
-// Frees an object of Python together with what it holds.
-template <typename Object, auto held> void free_object(PyObject *object) {
-    PyTypeObject *type = Py_TYPE(object);
-    delete (reinterpret_cast<Object *>(object)->*held);
-    type->tp_free(object);
-    Py_DECREF(type);
-}
-
-// A name as libsumo's own getters take it; false with an exception.
-bool encode_name(PyObject *name, std::string &encoded) {
-    PyObject *text = PyUnicode_AsEncodedString(name, "utf-8", "surrogateescape");
-    if (text) {
-        encoded.assign(PyBytes_AS_STRING(text), static_cast<size_t>(PyBytes_GET_SIZE(text)));
-        Py_DECREF(text);
-    }
-    return text != nullptr;
-}
-
-PyObject *text_of(const std::string &text) {
-    return PyUnicode_DecodeUTF8(text.data(), static_cast<Py_ssize_t>(text.size()), "surrogateescape");
-}
-
 // Pairs of floats, as x and y alternating.
 bool pairs(PyObject *list, std::vector<double> &values) {
     if (!PyList_CheckExact(list)) {
@@ -93,45 +71,23 @@ struct Scene {
 };
 
 // Vehicles(ids, lengths, widths, reaches)
-PyObject *vehicles_new(PyTypeObject *type, PyObject *arguments, PyObject *) {
-    PyObject *names, *lengths, *widths, *reaches;
-    if (!PyArg_ParseTuple(arguments, "O!OOO", &PyTuple_Type, &names, &lengths, &widths, &reaches)) {
-        return nullptr;
-    }
-    Vehicles *self = reinterpret_cast<Vehicles *>(type->tp_alloc(type, 0));
-    if (!self) {
-        return nullptr;
-    }
-    Roster *roster = self->roster = new Roster();
-    for (Py_ssize_t row = 0; row < PyTuple_GET_SIZE(names); row++) {
-        Py_ssize_t size;
-        const char *known = PyUnicode_AsUTF8AndSize(PyTuple_GET_ITEM(names, row), &size);
-        if (known) {
-            roster->ids.emplace_back(known, static_cast<size_t>(size));
-            continue;
-        }
-        PyErr_Clear();
-        if (!encode_name(PyTuple_GET_ITEM(names, row), roster->ids.emplace_back())) {
-            Py_DECREF(self);
-            return nullptr;
-        }
-    }
+std::unique_ptr<Roster> make_roster(std::vector<std::string> ids, PyObject *lengths, PyObject *widths, PyObject *reaches) {
+    auto roster = std::make_unique<Roster>();
+    roster->ids = std::move(ids);
     if (!numbers_of(lengths, roster->lengths) || !numbers_of(widths, roster->widths) ||
         !numbers_of(reaches, roster->reaches) || roster->lengths.size() != roster->widths.size() ||
         roster->lengths.size() != roster->reaches.size()) {
-        Py_DECREF(self);
-        return PyErr_Format(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
+        raise(PyExc_TypeError, "lengths, widths and reaches are lists of floats, as many of each");
     }
-    return reinterpret_cast<PyObject *>(self);
+    return roster;
 }
 
-Vehicles *vehicles_of(PyObject *object) {
-    if (Py_TYPE(object) != vehicles_type) {
-        PyErr_SetString(PyExc_TypeError, "these are no vehicles of the core");
-        return nullptr;
+template <> struct From<Vehicles *> {
+    static Vehicles *of(PyObject *given) {
+        return Py_TYPE(given) == vehicles_type ? reinterpret_cast<Vehicles *>(given)
+                                               : (raise(PyExc_TypeError, "these are no vehicles of the core"), nullptr);
     }
-    return reinterpret_cast<Vehicles *>(object);
-}
+};
 
 Columns *new_columns(Vehicles *vehicles, std::vector<double> &&values) {
     Columns *self = reinterpret_cast<Columns *>(columns_type->tp_alloc(columns_type, 0));
@@ -144,86 +100,63 @@ Columns *new_columns(Vehicles *vehicles, std::vector<double> &&values) {
 }
 
 void columns_free(PyObject *object) {
-    Py_XDECREF(reinterpret_cast<Columns *>(object)->vehicles);
-    free_object<Columns, &Columns::values>(object);
+    Columns *self = reinterpret_cast<Columns *>(object);
+    PyTypeObject *type = Py_TYPE(object);
+    Py_XDECREF(self->vehicles);
+    delete self->values;
+    type->tp_free(object);
+    Py_DECREF(type);
 }
 
-Columns *columns_of(PyObject *object) {
-    if (Py_TYPE(object) != columns_type) {
-        PyErr_SetString(PyExc_TypeError, "these are no columns of the core");
-        return nullptr;
+template <> struct From<Columns *> {
+    static Columns *of(PyObject *given) {
+        return Py_TYPE(given) == columns_type ? reinterpret_cast<Columns *>(given)
+                                              : (raise(PyExc_TypeError, "these are no columns of the core"), nullptr);
     }
-    return reinterpret_cast<Columns *>(object);
-}
+};
+template <> Columns &self_of<Columns>(PyObject *object) { return *reinterpret_cast<Columns *>(object); }
+PyObject *to_python(Columns *made) { return reinterpret_cast<PyObject *>(made); }
 
 // columns(vehicles, points, headings, speeds) -> Columns | None
-PyObject *columns(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Vehicles *vehicles = count == 4 ? vehicles_of(given[0]) : nullptr;
-    if (!vehicles) {
-        return PyErr_Format(PyExc_TypeError, "columns takes vehicles and three lists");
-    }
+std::optional<Columns *> columns(Vehicles *vehicles, PyObject *points, PyObject *headings, PyObject *speeds) {
     std::vector<double> values;
-    const bool known = pairs(given[1], values) && numbers_of(given[2], values) && numbers_of(given[3], values);
-    if (!known || PyList_GET_SIZE(given[1]) != PyList_GET_SIZE(given[2]) ||
-        PyList_GET_SIZE(given[1]) != PyList_GET_SIZE(given[3])) {
-        Py_RETURN_NONE;
+    const bool known = pairs(points, values) && numbers_of(headings, values) && numbers_of(speeds, values);
+    if (!known || PyList_GET_SIZE(points) != PyList_GET_SIZE(headings) ||
+        PyList_GET_SIZE(points) != PyList_GET_SIZE(speeds)) {
+        return {};
     }
-    return reinterpret_cast<PyObject *>(new_columns(vehicles, std::move(values)));
-}
-
-// Other code must not see a list that is filled in part; the garbage collector knows which entries are empty.
-PyObject *list_of(const double *values, size_t size) {
-    PyObject *list = PyList_New(static_cast<Py_ssize_t>(size));
-    for (size_t row = 0; list && row < size; row++) {
-        PyObject *value = PyFloat_FromDouble(values[row]);
-        if (!value) {
-            Py_CLEAR(list);
-        } else {
-            PyList_SET_ITEM(list, static_cast<Py_ssize_t>(row), value);
-        }
-    }
-    return list;
+    return new_columns(vehicles, std::move(values));
 }
 
 PyObject *columns_points(PyObject *object, void *) {
-    const Scene scene(reinterpret_cast<Columns *>(object));
-    PyObject *list = PyList_New(static_cast<Py_ssize_t>(scene.size));
-    for (size_t row = 0; list && row < scene.size; row++) {
-        PyObject *x = PyFloat_FromDouble(scene.x(row)), *y = PyFloat_FromDouble(scene.y(row));
-        PyObject *point = x && y ? PyTuple_New(2) : nullptr;
-        if (!point) {
-            Py_XDECREF(x);
-            Py_XDECREF(y);
-            Py_CLEAR(list);
-            break;
-        }
-        PyTuple_SET_ITEM(point, 0, x);
-        PyTuple_SET_ITEM(point, 1, y);
-        PyList_SET_ITEM(list, static_cast<Py_ssize_t>(row), point);
+    const Scene scene(&self_of<Columns>(object));
+    std::vector<std::tuple<double, double>> points;
+    for (size_t row = 0; row < scene.size; row++) {
+        points.emplace_back(scene.x(row), scene.y(row));
     }
-    return list;
+    return to_python(points);
 }
 
 PyObject *columns_headings(PyObject *object, void *) {
-    const Scene scene(reinterpret_cast<Columns *>(object));
-    return list_of(scene.headings, scene.size);
+    const Scene scene(&self_of<Columns>(object));
+    return to_python(std::vector<double>(scene.headings, scene.headings + scene.size));
 }
 
 PyObject *columns_speeds(PyObject *object, void *) {
-    const Scene scene(reinterpret_cast<Columns *>(object));
-    return list_of(scene.speeds, scene.size);
+    const Scene scene(&self_of<Columns>(object));
+    return to_python(std::vector<double>(scene.speeds, scene.speeds + scene.size));
 }
 
-PyObject *columns_speed(PyObject *object, PyObject *number) {
-    const Scene scene(reinterpret_cast<Columns *>(object));
-    const Py_ssize_t row = PyLong_AsSsize_t(number);
-    if (PyErr_Occurred()) {
-        return nullptr;
-    }
-    if (row < 0 || static_cast<size_t>(row) >= scene.size) {
-        return PyErr_Format(PyExc_IndexError, "no actor has this row");
-    }
-    return PyFloat_FromDouble(scene.speeds[row]);
+PyObject *columns_recorded(PyObject *object, void *) {
+    const std::vector<double> &values = *self_of<Columns>(object).values;
+    return PyBytes_FromStringAndSize(reinterpret_cast<const char *>(values.data()),
+                                     static_cast<Py_ssize_t>(8 * values.size()));
+}
+
+double columns_speed(Columns &columns, long row) {
+    const Scene scene(&columns);
+    return row < 0 || static_cast<size_t>(row) >= scene.size ? (raise(PyExc_IndexError, "no actor has this row"), 0)
+                                                             : scene.speeds[row];
 }
 
 // As max(speeds) of Python's, also of what is not a number.
@@ -286,16 +219,11 @@ std::vector<double> read_now(const Roster &roster) {
     return values;
 }
 
-PyObject *vehicles_read(PyObject *object, PyObject *) {
-    if (unbound()) {
-        return nullptr;
-    }
-    Vehicles *self = reinterpret_cast<Vehicles *>(object);
-    try {
-        return reinterpret_cast<PyObject *>(new_columns(self, read_now(*self->roster)));
-    } catch (...) { // libsumo's own exceptions: its getters raise the same, as Python's
-        Py_RETURN_NONE;
-    }
+template <> Vehicles &self_of<Vehicles>(PyObject *object) { return *reinterpret_cast<Vehicles *>(object); }
+
+Columns *vehicles_read(Vehicles &vehicles) {
+    require_bound();
+    return new_columns(&vehicles, read_now(*vehicles.roster));
 }
 
 // Who is near one of some vehicles, as numbers of the names, and the numbers of these vehicles.
@@ -365,58 +293,29 @@ PyObject *near_names() {
 // Vehicles.look(controlled: Vehicles, distance squared) -> Columns | ids | None
 // What most steps come to: no actor has come or gone, none is on foot, none has collided. None where any of this is
 // otherwise; the ids of all who are near, where there is a distance and these are others than before.
-PyObject *vehicles_look(PyObject *object, PyObject *const *given, Py_ssize_t count) {
-    Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
-    if (!controlled) {
-        return PyErr_Format(PyExc_TypeError, "look takes vehicles and a number");
+PyObject *vehicles_look(Vehicles &vehicles, Vehicles *controlled, double within) {
+    require_bound();
+    if (coming_or_going() || sumo.on_foot() || !sumo.collisions().empty()) {
+        return Py_NewRef(Py_None);
     }
-    const double within = PyFloat_AsDouble(given[1]);
-    if (unbound() || PyErr_Occurred()) {
-        return nullptr;
-    }
-    Vehicles *self = reinterpret_cast<Vehicles *>(object);
-    try {
-        if (coming_or_going() || sumo.on_foot() || !sumo.collisions().empty()) {
-            Py_RETURN_NONE;
+    if (within > 0) {
+        around.look(*controlled->roster, within);
+        if (!around.same(*vehicles.roster)) {
+            return near_names();
         }
-        if (within > 0) {
-            around.look(*controlled->roster, within);
-            if (!around.same(*self->roster)) {
-                return near_names();
-            }
-        }
-        return reinterpret_cast<PyObject *>(new_columns(self, read_now(*self->roster)));
-    } catch (...) {
-        Py_RETURN_NONE;
     }
+    return to_python(vehicles_read(vehicles));
 }
 
 // in_sight(controlled: Vehicles, distance squared) -> (ids, eyes) | None
 // As Sight._in_sight of sumo/_scene_reader.py: who is near one of the controlled vehicles, and where
 // these are.
-PyObject *in_sight(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    Vehicles *controlled = count == 2 ? vehicles_of(given[0]) : nullptr;
-    if (!controlled) {
-        return PyErr_Format(PyExc_TypeError, "in_sight takes vehicles and a number");
-    }
-    const double within = PyFloat_AsDouble(given[1]);
-    if (unbound() || PyErr_Occurred()) {
-        return nullptr;
-    }
-    try {
-        around.look(*controlled->roster, within);
-    } catch (...) {
-        Py_RETURN_NONE;
-    }
-    PyObject *ids = near_names(), *points = PyList_New(0);
-    bool good = ids && points;
+std::tuple<Ref, std::vector<std::tuple<double, double>>> in_sight(Vehicles *controlled, double within) {
+    require_bound();
+    around.look(*controlled->roster, within);
+    std::vector<std::tuple<double, double>> points;
     for (size_t eye : around.eyes) {
-        PyObject *point = good ? Py_BuildValue("(dd)", around.places[2 * eye], around.places[2 * eye + 1]) : nullptr;
-        good = point && PyList_Append(points, point) == 0;
-        Py_XDECREF(point);
+        points.emplace_back(around.places[2 * eye], around.places[2 * eye + 1]);
     }
-    PyObject *found = good ? PyTuple_Pack(2, ids, points) : nullptr;
-    Py_XDECREF(ids);
-    Py_XDECREF(points);
-    return found;
+    return {Ref(near_names()), points};
 }

@@ -97,23 +97,18 @@ struct Way {
 // others. As `_straight` of crashhunt/world/_tracks.py, of every so many scenes. Where a distance ahead is given, those
 // are left out whom the agent would not touch so far ahead of it and behind it, on its way and as much further straight
 // on.
-PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
-    if (count != 6) {
-        return PyErr_Format(PyExc_TypeError, "tracks takes parts and five numbers");
-    }
-    const long long every = PyLong_AsLongLong(given[1]);
-    const double within = PyFloat_AsDouble(given[2]), ahead = PyFloat_AsDouble(given[3]);
-    const double behind = PyFloat_AsDouble(given[4]), unknown = PyFloat_AsDouble(given[5]);
-    std::vector<Part> parts;
-    if (PyErr_Occurred() || every < 1 || !read_parts(given[0], parts)) {
-        return PyErr_Occurred() ? nullptr : Py_NewRef(Py_None);
+std::optional<std::tuple<Bytes, Bytes>> tracks(List list, long long every, double within, double ahead, double behind,
+                                               double unknown) {
+    const auto parts = parts_of(list);
+    if (!parts || every < 1) {
+        return {};
     }
     std::vector<std::vector<double>> own(5), others(5); // x, y, heading, half length, half width
     std::vector<std::vector<int64_t>> steps(1), pairs(2); // the scene; the sample and whose
     int64_t step = -1, sample = -1;
     Way way;
     if (ahead > 0) {
-        for (const Part &part : parts) {
+        for (const Part &part : *parts) {
             const size_t row = static_cast<size_t>(part.own);
             for (size_t scene = 0; scene < part.scenes; scene++) {
                 step++;
@@ -126,7 +121,7 @@ PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
         step = -1;
     }
     const bool chosen = ahead > 0 && way.known;
-    for (const Part &part : parts) {
+    for (const Part &part : *parts) {
         const size_t actors = part.actors, row = static_cast<size_t>(part.own);
         for (size_t scene = 0; scene < part.scenes; scene++) {
             step++;
@@ -167,5 +162,5 @@ PyObject *tracks(PyObject *, PyObject *const *given, Py_ssize_t count) {
             }
         }
     }
-    return both(both(bytes_of(own), bytes_of(steps)), both(bytes_of(others), bytes_of(pairs)));
+    return std::tuple(Bytes(bytes_of(own), bytes_of(steps)), Bytes(bytes_of(others), bytes_of(pairs)));
 }

@@ -97,10 +97,10 @@ class BlackBox:
         self._map: mmap.mmap
         self._offset = FIRST
         self._step = 0
-        self._agents = 0
         self._roster: Roster | None = None
         self._core: Core | None = None
-        self._steps: dict[int, struct.Struct] = {}
+        self._step_head = struct.Struct("<BxHIqd")  # of a record of a step, with the rewards
+        self._numbers: dict[int, struct.Struct] = {}  # of a scene, by the number of actors
         self._trail: list[tuple[Roster | None, list[int], list[Scene | None]]] = []
         self._aside: list[tuple[int, int]] = []
         self._lent: UsualSteps | None = None
@@ -132,8 +132,7 @@ class BlackBox:
 
     def prologue(self, payload: bytes, agents: int) -> None:
         """Record the prologue of the trial; ``agents`` is the number of rewards in each step."""
-        self._agents = agents
-        self._steps = {}
+        self._step_head = struct.Struct(f"<BxHIqd{agents}d")
         self.append(PROLOGUE.tag, 0, payload)
 
     def append(self, tag: int, aux: int, payload: bytes) -> None:
@@ -211,11 +210,6 @@ class BlackBox:
         if offset + length + 16 > self._reserved:
             self._reserve(offset + length + 16)
         mapped = self._map
-        if self._core is not None:
-            written = self._core.write_array(mapped, offset, tag, agent, array, self._step, phase)
-            if written is not None:
-                self._offset = written
-                return
         RECORD_HEAD.pack_into(mapped, offset, tag, agent, length)
         start = offset + 8
         end = start + length
@@ -230,33 +224,22 @@ class BlackBox:
         """Record a completed step; the scene's roster must already have been recorded."""
         if self._lent is not None:
             self._stop_core()
-        offset, count = self._offset, len(scene.roster)
-        packer = self._steps.get(count)
-        if packer is None:
-            packer = self._steps[count] = struct.Struct(f"<BxHIqd{self._agents + 4 * count}d")
-        if offset + packer.size > self._reserved:
-            self._reserve(offset + packer.size)
-        core, columns, end = scene.core, scene.columns, None
-        if core is not None and columns is not None:
-            where = (self._map, offset, _STEP, step)
-            end = core.write_step(*where, scene.time_s, rewards, columns, _SIMULATE)
-        if end is None:
-            packer.pack_into(
-                self._map,
-                offset,
-                _STEP,
-                0,
-                packer.size - 8,
-                step,
-                scene.time_s,
-                *rewards,
-                *chain.from_iterable(scene.points),
-                *scene.headings,
-                *scene.speeds,
-            )
-            end = offset + packer.size
-            _PROGRESS.pack_into(self._map, _PROGRESS_OFFSET, end, step, _SIMULATE, 0)
-        self._roster, self._core = scene.roster, core
+        offset, count, head = self._offset, len(scene.roster), self._step_head
+        start = offset + head.size
+        end = start + 32 * count
+        if end > self._reserved:
+            self._reserve(end)
+        mapped, columns = self._map, scene.columns
+        head.pack_into(mapped, offset, _STEP, 0, end - offset - 8, step, scene.time_s, *rewards)
+        if columns is not None:
+            mapped[start:end] = columns.recorded
+        else:
+            packer = self._numbers.get(count)
+            if packer is None:
+                packer = self._numbers[count] = struct.Struct(f"<{4 * count}d")
+            packer.pack_into(mapped, start, *chain.from_iterable(scene.points), *scene.headings, *scene.speeds)
+        _PROGRESS.pack_into(mapped, _PROGRESS_OFFSET, end, step, _SIMULATE, 0)
+        self._roster, self._core = scene.roster, scene.core
         rest = scene if scene.heights or scene.spines else None
         self._trail.append((scene.roster, [end - 32 * count], [rest]))
         self._offset, self._step = end, step
