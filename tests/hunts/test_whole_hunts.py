@@ -7,7 +7,6 @@ import json
 import os
 import sys
 from contextlib import closing
-from dataclasses import replace
 
 import pytest
 from test_hunt_loop import TOY
@@ -165,46 +164,3 @@ def test_a_hunt_whose_watcher_fails_records_why_it_ended(tmp_path):
         crashhunt.run(tmp_path / "h", 1, 3, 60, watch=watch, **OPTIONS)
     state = hunt_state(tmp_path / "h")
     assert (state.state, state.detail, state.damaged) == ("error", "RuntimeError: the screen is gone", False)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"until_rate": "0.3/trial", "most": 40},
-        {"trials": 20, "rare": True, "disturb": ["brake=0.02"], "arguments": {"speed": 9.0}},
-    ],
-    ids=["until a rate", "rare"],
-)
-def test_full_disk_under_a_hunt_for_a_rate_changes_no_number(tmp_path, monkeypatch, options):
-    words = {"trials": 0, "max_steps": 60, "keep_going": True, "keep": 1, **OPTIONS, **options}
-    whole = crashhunt.run(tmp_path / "whole", 1, **words)
-    recorded = 0
-    record = Ledger.record
-
-    def fill(ledger, result, *, snapshot):
-        nonlocal recorded
-        recorded += 1
-        if recorded > 4:
-            ledger._database.execute("PRAGMA max_page_count = 1")  # SQLite makes it the present size of the file
-        record(ledger, result, snapshot=snapshot)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Ledger, "record", fill)
-        with pytest.raises(
-            HuntDirectoryError, match=r"the disk is full \(.*\); free some space and run the same"
-        ) as caught:
-            crashhunt.run(tmp_path / "h", 1, **words)
-    assert "\n" not in str(caught.value)
-    state = hunt_state(tmp_path / "h")
-    assert (state.state, state.damaged) == ("error", False)
-    assert 4 <= state.trials_run < sum(whole.outcomes.values())
-    (checked,) = check(tmp_path / "h")
-    assert checked.fine
-    resumed = crashhunt.run(tmp_path / "h", 1, **words)
-    assert rows(tmp_path / "h") == rows(tmp_path / "whole")
-    assert resumed.outcomes == whole.outcomes
-    if whole.rate is not None:
-        assert resumed.rate == replace(whole.rate, dir=str(tmp_path / "h"))
-    if whole.rare is not None:
-        assert resumed.rare.estimate == whole.rare.estimate
