@@ -128,6 +128,8 @@ def described_by_fmi_2(place: str, speed: str) -> str:
 <fmiModelDescription fmiVersion="2.0" modelName="planner" guid="{{1}}">
 <CoSimulation modelIdentifier="planner"/>
 <UnitDefinitions><Unit name="m/s"/></UnitDefinitions>
+<TypeDefinitions><SimpleType name="Lane"><Enumeration><Item name="stay" value="0"/></Enumeration></SimpleType>
+</TypeDefinitions>
 <ModelVariables>
 {"".join(variables)}
 <ScalarVariable name="speed" valueReference="100" causality="parameter" variability="fixed">
@@ -138,7 +140,7 @@ def described_by_fmi_2(place: str, speed: str) -> str:
 <Integer start="0"/></ScalarVariable>
 <ScalarVariable name="{speed}" valueReference="110" causality="output"><Real/></ScalarVariable>
 <ScalarVariable name="lane_change" valueReference="111" causality="output" variability="discrete">
-<Integer/></ScalarVariable>
+<Enumeration declaredType="Lane"/></ScalarVariable>
 </ModelVariables>
 <ModelStructure><Outputs><Unknown index="{len(inputs) + 4}"/><Unknown index="{len(inputs) + 5}"/></Outputs>
 </ModelStructure>

@@ -166,6 +166,11 @@ def test_an_action_that_is_not_a_number_is_left_to_the_check_of_all_agents(tmp_p
         SpeedAndLaneChange().encode(agent_of(build_fmu(tmp_path, 2), harm=2).act(observations()[0]))
 
 
+A_TEXT = described_by_fmi_2("kinematics[{row}].{column}", "target_speed").replace(
+    '<Enumeration declaredType="Lane"/>', "<String/>"
+)
+
+
 @pytest.mark.parametrize(
     ("options", "table", "message"),
     one_in(
@@ -187,6 +192,7 @@ def test_an_action_that_is_not_a_number_is_left_to_the_check_of_all_agents(tmp_p
             ({}, '[inputs]\n"kinematics[1].x" = "kinematics[1]"', "kinematics[1].x has 1 values, and its place 7"),
             ({}, "[outputs]\nx = 1", "planner.toml has outputs (allowed: the tables inputs, action)"),
             ({}, "[inputs", "planner.toml cannot be read: "),
+            ({"description": A_TEXT}, "", "its variable lane_change is of type String, which is no number"),
         ],
     ),
 )
