@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
@@ -135,6 +136,21 @@ def is_empty_folder(path: Path) -> bool:
         OSError: the folder may not be read.
     """
     return path.is_dir() and not any(path.iterdir())
+
+
+@contextmanager
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Return a context that holds the lock of a folder, after other processes have released it.
+
+    Raises:
+        OSError: the folder does not exist, or the file system has no locks.
+    """
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(opened)
 
 
 def sync_folder(*folders: str | Path) -> None:

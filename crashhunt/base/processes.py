@@ -91,6 +91,19 @@ def exits_refused() -> Iterator[None]:
         os._exit = leave
 
 
+def exit_as(code: int) -> NoReturn:
+    """End this process with the exit code of another one; a negative code is the signal that ended it."""
+    if code < 0:
+        import resource
+
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # that of the other process, if there is one, is enough
+        if -code not in (signal.SIGKILL, signal.SIGSTOP):
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code & 0xFF)
+
+
 def outlive_parent() -> None:
     """Undo `die_with`: this process continues when its parent ends."""
     _prctl(_PR_SET_PDEATHSIG, 0)

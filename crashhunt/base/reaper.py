@@ -114,7 +114,7 @@ def _main() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _FORWARDED_SIGNALS)
     status = _wait(child, int(lifeline), processes.resume)
     processes.end_descendants()
-    _exit_as(status)
+    processes.exit_as(1 if status is None else os.waitstatus_to_exitcode(status))
 
 
 def _import_sibling(name: str) -> ModuleType:
@@ -146,22 +146,6 @@ def _wait(child: int, lifeline: int, resume: Callable[[int], None]) -> int | Non
             return status
         if not ready:
             resume(child)
-
-
-def _exit_as(status: int | None) -> None:
-    """Exit with the status of the child, so the owner sees the same status as without a keeper."""
-    if status is None:
-        os._exit(1)
-    code = os.waitstatus_to_exitcode(status)
-    if code < 0:
-        import resource
-
-        with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the child's, where there is one, is enough
-        if -code not in (signal.SIGKILL, signal.SIGSTOP):
-            signal.signal(-code, signal.SIG_DFL)
-        os.kill(os.getpid(), -code)
-    os._exit(code & 0xFF)
 
 
 if __name__ == "__main__":

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import re
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from crashhunt.base import layout
 from crashhunt.base.codec import JsonObject, known_part, typed_where_there
 from crashhunt.base.errors import BundleError
+from crashhunt.base.files import locked_folder
 from crashhunt.base.integrity import FILES, FileEntry, changed_file, digest_of_data, read_object, typed
 from crashhunt.base.older_versions import HOW_TO_READ
 from crashhunt.base.text import listed, near_path, one_of
@@ -297,15 +296,10 @@ def as_stored(bundle: Bundle) -> Bundle:
 @contextmanager
 def changing(bundle: Bundle) -> Iterator[Bundle]:
     """Yield a bundle as it is on the disk now, to be changed and written; other processes wait until it is written."""
-    folder: int | None = None
-    with suppress(OSError):  # a hunt has deleted the bundle, or the file system has no locks
-        folder = os.open(bundle.path, os.O_RDONLY | os.O_CLOEXEC)
-        fcntl.flock(folder, fcntl.LOCK_EX)
-    try:
+    with ExitStack() as held:
+        with suppress(OSError):  # a hunt has deleted the bundle, or the file system has no locks
+            held.enter_context(locked_folder(bundle.path))
         yield as_stored(bundle)
-    finally:
-        if folder is not None:
-            os.close(folder)
 
 
 def _bundle(path: Path, data: JsonObject) -> Bundle:

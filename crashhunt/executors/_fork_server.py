@@ -35,7 +35,7 @@ from crashhunt.base.errors import DISK, CrashhuntError
 from crashhunt.base.exceptions import message_of
 from crashhunt.base.forks import ended
 from crashhunt.base.plugins import locate
-from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, kill, resume
+from crashhunt.base.processes import adopt_orphans, die_with, end_descendants, exit_as, kill, resume
 from crashhunt.base.resources import limit_behind
 from crashhunt.base.shared_memory import SharedMemoryWatch
 from crashhunt.base.signals import is_sent_from_outside
@@ -216,9 +216,7 @@ class _Server:
             _send(self._control, import_died(self._watch.importing, code).to_json())
         if code < 0:
             end_descendants()
-            signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
-            os.kill(os.getpid(), -code)
-        os._exit(code)
+        exit_as(code)
 
 
 def _be_template(orders: socket.socket, settings: WorkerSettings, *, late: bool) -> None:

@@ -12,11 +12,9 @@ their outcome.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
-import os
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from crashhunt.base import layout
 from crashhunt.base.codec import Serializable
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UsageError
-from crashhunt.base.files import whole_file
+from crashhunt.base.files import locked_folder, whole_file
 from crashhunt.base.integrity import parse_object, read_bounded, typed
 from crashhunt.base.text import near_path
 from crashhunt.crashes import Bundle, list_bundles, read_bundle
@@ -32,7 +30,7 @@ from crashhunt.plans import read_settings
 from crashhunt.snapshots import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
     from crashhunt.plans import HuntSettings
 
@@ -161,7 +159,7 @@ class TrainedOn:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             # A lock of the folder leaves no further file next to the policy.
-            with _locked(path.parent):
+            with locked_folder(path.parent):
                 before = read_trained_on(path) if path.exists() else self
                 if before.test != self.test:
                     raise UsageError(
@@ -183,17 +181,6 @@ class TrainedOn:
             raise HuntDirectoryError(
                 f"cannot be written: {error.strerror}", fix="name a file in a writable folder", where=str(path)
             ) from error
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Return a context that holds the lock of a folder; the lock ends with this process."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def read_trained_on(path: Path) -> TrainedOn:
