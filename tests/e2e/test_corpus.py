@@ -53,11 +53,6 @@ def drive(shell, code):
     (shell.folder / "driver.py").write_text(code)
 
 
-def expect(shell, number, word):
-    file = sorted((shell.folder / "kept crashes").glob("*/crashhunt-case.toml"))[number]
-    file.write_text(file.read_text().replace('expect = "still"', f'expect = "{word}"'))
-
-
 def test_a_case_is_small_has_no_code_and_is_looked_at_like_a_hunt(kept):
     cases = kept.crashhunt("corpus", "list", "kept crashes", "--json").json["cases"]
     assert [case["expected"] for case in cases] == ["still", "still"]
@@ -139,29 +134,6 @@ def test_ctrl_c_ends_all_and_reports_what_has_ended(kept):
 def test_a_case_of_an_earlier_version_is_run(shell):
     (report,) = run_cases([FROZEN], trusted=True)  # also where the tests lie outside their repository
     assert (report.got, report.ok, report.now) == ("still", True, report.was)
-
-
-def pytest_run(kept, *words, plugins=("crashhunt.corpus.pytest_plugin",)):
-    names = [word for plugin in plugins for word in ("-p", plugin)]
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-W", "error", *names, *words], cwd=kept.folder, capture_output=True,
-        text=True, env={**kept.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}, check=False, timeout=120,
-    )  # fmt: skip
-
-
-@pytest.mark.nightly
-def test_pytest_chooses_repeats_and_spreads_cases(kept):
-    expect(kept, 0, "fixed")
-    assert "1 xfailed" in pytest_run(kept, "kept crashes", "-k", "000001").stdout
-    spread = pytest_run(kept, "kept crashes", "-n", "2", plugins=("crashhunt.corpus.pytest_plugin", "xdist"))
-    assert "1 failed, 1 xfailed" in spread.stdout, spread.stdout + spread.stderr
-    assert "1 failed" in pytest_run(kept, "kept crashes", "--lf").stdout
-    drive(kept, MENDED)
-    assert "1 passed" in pytest_run(kept, "kept crashes", "--lf").stdout
-    (kept.folder / "driver.py").unlink()
-    said = pytest_run(kept, "kept crashes").stdout
-    assert said.count("cannot be imported") == 2
-    assert "look at it" not in said  # nothing is kept of what cannot run
 
 
 def test_pytests_start_imports_the_thin_module_only():

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import tomllib
 
-import pytest
-
 CALM = "calm=always (acceleration > -6)"
 
 
@@ -100,19 +98,3 @@ class Follows:
         self.steps += 1
         return self.speed((self.steps - 1) * self.step_s), 0
 """
-
-
-@pytest.mark.nightly
-def test_an_argument_may_be_a_signal_over_time(toy):
-    (toy.folder / "driver.py").write_text(DRIVER)
-    words = ["--agent", "driver:Follows", "--arg", "speed=signal:0:20:points=3:kind=linear", "--oracle", "none"]
-    done = hunt(toy, *words, "--require", "always (speed < 15)", "--sampler", "guided", trials="40").json
-    crash = done["crashes"][0]
-    values = crash["arguments"]["ego"]
-    assert (crash["outcome"], crash["confirmed"]) == ("requirement", True)
-    assert values["speed"].startswith("signal:linear:3:")
-    assert all(0 <= values[f"speed[{number}]"] <= 20 for number in range(3))
-    assert toy.crashhunt("replay", "h", "--json").json["verdict"] == "reproduced"
-    assert "speed[0]" in toy.crashhunt("show", "h").out
-    refused = hunt(toy, "--agent", "driver:Follows", "--arg", "speed=signal:0:20:kind=liner", name="o", expect=2)
-    assert "did you mean 'linear'?" in refused.err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import sys
 from contextlib import closing
 
 import pytest
@@ -104,35 +103,6 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
 def facts_of(hunt):
     with closing(Ledger(hunt / "ledger.sqlite")) as ledger:
         return ledger.facts()
-
-
-@pytest.mark.long
-@pytest.mark.nightly
-def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path, monkeypatch, capfd):
-    # Hunting from a script without a guard: if a worker imported it again, this would run there.
-    (tmp_path / "script.py").write_text(f"print('again')\nopen({str(tmp_path / 'again')!r}, 'w')\n")
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(tmp_path / "script.py"), raising=False)
-    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
-    found = {}
-    for parallel in (1, 3):
-        hunt = tmp_path / f"h{parallel}"
-        report = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)
-        assert report.stopped_because == "crash"
-        crash = min(report.crashes, key=lambda bundle: bundle.result.spec.number)
-        assert crash.confirmed
-        number = crash.result.spec.number
-        assert set(range(number + 1)) <= rows(hunt).keys()
-        assert all(rows(hunt)[before][0] == "survived" for before in range(number))
-        assert hunt_state(hunt).state == "crashed"
-        again = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)  # states again what it found
-        assert [(one.id, one.confirmed) for one in again.crashes] == [(one.id, True) for one in report.crashes]
-        assert (again.stopped_because, again.outcomes) == ("crash", report.outcomes)
-        found[parallel] = number, crash.result.digest, [rows(hunt)[before] for before in range(number)]
-        assert (report.kinds, report.audit, report.to_json()["audit"]) == (None, None, None)
-        assert "kinds" not in report.to_json()
-    assert found[1] == found[3]
-    assert capfd.readouterr() == ("", "")
-    assert not (tmp_path / "again").exists()
 
 
 @pytest.mark.parametrize(
