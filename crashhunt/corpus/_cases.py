@@ -219,7 +219,6 @@ def add_case(bundle: Bundle, corpus: Path, *, expect: Expectation | None = None,
     name = f"{_id(bundle)}-{bundle.result.digest[:6]}"
     final = corpus / name
     try:
-        corpus.mkdir(parents=True, exist_ok=True)
         remove_ended(corpus)
         if not final.exists():
             case = Case(
