@@ -85,3 +85,22 @@ def test_the_last_step_is_the_one_that_running_every_step_finds(shell, monkeypat
     if found.attempts[0].last_step is None or found.attempts[0].last_step >= first:
         assert every.attempts[0].last_step == found.attempts[0].last_step
     assert judgement_of(bundle) is None
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("scenario", "words"),
+    [("loop", ("--arg", "speed=20:25", "--seed", "1")), ("highway", ("--seed", "1"))],
+)
+def test_what_it_hangs_on_does_not_depend_on_how_many_run_at_a_time(shell, scenario, words):
+    shell.crashhunt("run", "h", "2", "200", "400", "--scenario", scenario, *words)
+    bundle = find_bundle(shell.folder / "h")
+    one, three = (judge(bundle, ReplayOptions(), runs=1, why=60, parallel=parallel).why for parallel in (1, 3))
+    assert one == three
+    assert one is not None
+    assert one.runs == 60
+    others = [factor for factor in one.factors if factor.kind == "other"]
+    assert others
+    assert sum(factor.clear for factor in others) > 0.9 * sum(len(factor.runs) for factor in others)
+    partner = next(factor for factor in others if factor.name == bundle.result.collision.other)
+    assert partner.what != "there" or partner.same == 0

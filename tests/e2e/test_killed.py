@@ -24,8 +24,10 @@ from conftest import keeps_going, mostly_nightly, wait_for
 from crashhunt.base.git import run_to_end
 from crashhunt.base.process_owners import OwnerProcess, owner_in, start_time, this_process
 from crashhunt.base.temporary import remove_leftovers, remove_tree
+from crashhunt.crashes import list_bundles
 from crashhunt.errors import HuntDirectoryError
-from crashhunt.hunts import check, salvage
+from crashhunt.hunts import Hunt, check, salvage
+from crashhunt.plans import Request, plan
 from crashhunt.results import hunt_state
 from crashhunt.suites import _hunt_reruns, _processes, _request_file
 
@@ -298,6 +300,44 @@ def test_a_signal_ends_a_command_after_it_has_removed_everything(toy, made_once,
     assert left_in(toy.folder) == []
 
 
+LEAVES_MEMORY = """
+from multiprocessing import shared_memory
+from crashhunt.agents import KeepLaneWithSpeed
+kept = []
+class Leaves(KeepLaneWithSpeed):
+    def __init__(self, **arguments):
+        super().__init__(**arguments)
+        kept.append(shared_memory.SharedMemory(create=True, size=64))
+        open("created.txt", "a").write(kept[-1].name + "\\n")
+"""
+
+
+@pytest.mark.nightly
+def test_a_hunt_that_was_killed_leaves_nothing_for_long_not_even_shared_memory(toy, temporary_files):
+    (toy.folder / "leaves.py").write_text(LEAVES_MEMORY)
+    toy.environment["TMPDIR"] = str(temporary_files)
+    words = ("run", "h", "2", "8", "40", "--scenario", "toy", "--agent", "leaves:Leaves", "--arg", "speed=5", "--set",
+             "step_wall_s=0.01", "--seed", "1")  # fmt: skip
+    process = toy.start(*words)
+    wait_for(lambda: rows(toy.folder / "h"))
+    created = toy.folder / "created.txt"
+    wait_for(lambda: not all(Path("/dev/shm", name).exists() for name in created.read_text().split()))
+    assert process.poll() is None  # what a trial left does not stay until the end of a long hunt
+    wait_for(lambda: [*toy.folder.glob("h/.scratch-*/shared-memory-*.txt")], every_s=0.01)
+    process.kill()
+    process.communicate(timeout=300)
+    wait_for(lambda: not processes_of(toy.folder))
+    assert len([*toy.folder.glob("h/.scratch-*")]) == 1
+    toy.crashhunt("oracles")
+    assert left_in(toy.folder) == []
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
+    toy.crashhunt(*words)
+    assert sorted(rows(toy.folder / "h")) == [*range(8)]
+    assert len(created.read_text().split()) >= 8
+    assert not [name for name in created.read_text().split() if Path("/dev/shm", name).exists()]
+    assert left_in(toy.folder) == []
+
+
 def leftover(folder: Path, start: str, *, alive: bool = False, boot: str = "") -> Path:
     """Make a folder with the name of something temporary, of this process or of one that has ended."""
     here = this_process()
@@ -327,3 +367,21 @@ def test_what_no_link_leads_to_goes_where_it_lies(toy, made_once, monkeypatch):
     toy.crashhunt("corpus", "add", str(min((hunt / "crashes").glob("[!.]*"))), "--to", "kept")
     assert [path for path in before if path.exists()] == []
     assert [path for path in stay if not path.exists()] == []
+
+
+@pytest.mark.nightly
+def test_a_hunt_that_is_stopped_while_it_confirms_is_resumed_by_a_rerun(toy, monkeypatch):
+    monkeypatch.chdir(toy.folder)
+    scenario, settings = plan(Request(scenario="toy", trials=3, max_steps=60, arguments={"speed": "20"}))
+    asked = []
+
+    def stop(status):
+        if status.phase == "confirming" and not asked:
+            asked.append(os.kill(os.getpid(), signal.SIGTERM))
+
+    report = Hunt(toy.folder / "h", scenario, settings).run(stop)
+    assert [crash.confirmed for crash in report.crashes] == [None]
+    assert hunt_state(toy.folder / "h").state == "interrupted"
+    (state,) = toy.crashhunt("rerun", "h", "--json").json["hunts"]
+    assert state["state"] == "crashed"
+    assert [bundle.confirmed for bundle in list_bundles(toy.folder / "h")] == [True]

@@ -9,14 +9,30 @@ import zipfile
 from typing import TYPE_CHECKING
 
 import pytest
+from conftest import Shell
 from test_replay import hunted_on_sumo
 
+from crashhunt.base.sandbox import landlock_version
+from crashhunt.crashes import find_bundle, open_archive
 from crashhunt.errors import CrashhuntError, UsageError
+from crashhunt.replays import ReplayOptions, replay
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-OPTIONS = "scenario/scenario.toml"
+STRANGER = ReplayOptions(code="log", force=True, trusted=False)
+OPTIONS, ROUTES = "scenario/scenario.toml", "scenario/traffic.rou.xml"
+
+
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory):
+    """A crash of the shipped scenario without its code, hundreds of files that recorded actions have no need of."""
+    shell = Shell(tmp_path_factory.mktemp("exported"))
+    words = ("--arg", "speed=19", "--set", "vehicles=35", "--seed", "1", "--timeout", "140", "--no-snapshot")
+    done = shell.crashhunt("run", "h", "1", "9", "600", *words, "--json", expect=None)
+    assert done.json["crashes"], done.err
+    shell.crashhunt("export", "h", "crash.zip")
+    return shell.folder / "crash.zip"
 
 
 @pytest.fixture
@@ -36,6 +52,8 @@ def changed(source: Path, target: Path, *edits: tuple[str, str, str]) -> Path:
         name = file if file in files else next(name for name in files if name.endswith(f"/{file}"))
         assert before.encode() in files[name], file
         files[name] = files[name].replace(before.encode(), after.encode(), 1)
+        if ".add.xml" in after:
+            files[name.replace("scenario.toml", "d.add.xml")] = after.partition("<!--")[2].partition("-->")[0].encode()
     index = json.loads(files.pop("archive.json"))
     for name, data in files.items():
         digest = hashlib.blake2b(data, digest_size=16).hexdigest()
@@ -44,6 +62,55 @@ def changed(source: Path, target: Path, *edits: tuple[str, str, str]) -> Path:
         for name, data in {**files, "archive.json": json.dumps(index).encode()}.items():
             new.writestr(name, data)
     return target
+
+
+def option(name: str, value: object) -> tuple[str, str, str]:
+    return OPTIONS, "[sumo.options]", f"[sumo.options]\n{json.dumps(name)} = {json.dumps(value)}"
+
+
+def detector(victim: Path) -> tuple[str, str, str]:
+    """An additional file, which stands in a comment of the scenario."""
+    loop = f'<inductionLoop id="d" lane="south_0" pos="5" period="1" file="{victim}"/>'
+    text = f'# <!--<additional>{loop}</additional>-->\nadditional = ["d.add.xml"]\nnet = '
+    return OPTIONS, "net = ", text
+
+
+ADDITIONAL = (OPTIONS, "additional = []\n", "")
+# Of the issue, and what else came to mind.
+NAMES = ["netstate-dump", "ndump", "tripinfo", "summary", "vehroutes", "C", "l", "log-file", "save-state.prefix"]
+NAMES += ["device.ssm.file", "device.toc.file", "fcd-output", "made-up", "remote-port", "configuration-file", "weights"]
+
+
+DOORS_OPEN = """
+from crashhunt.sumo import _files as files
+files.is_output = files.is_shown = lambda name: False
+files.rewritten = lambda content, *_: content
+files.FIXED_OPTIONS.pop("device.ssm.file", None)
+"""
+
+
+@pytest.mark.nightly  # by day, base/test_sandbox.py, and executors/test_zygotes.py seals
+@pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+@pytest.mark.parametrize("attack", ["netstate-dump", "C", "a detector"])
+def test_the_kernel_alone_holds_what_has_got_past_all_else(crash, tmp_path, monkeypatch, attack):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    edits = [ADDITIONAL, detector(victim)] if attack == "a detector" else [option(attack, str(victim))]
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open" / "sitecustomize.py").write_text(DOORS_OPEN)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "open"))
+    monkeypatch.setattr("crashhunt.replays._prepare.refuse_side_effects", lambda *_: None)
+    with open_archive(changed(crash, tmp_path / "bad.zip", *edits)) as archive:
+        bundle = find_bundle(archive.directory, "")
+        try:
+            verdict = replay(bundle, STRANGER).verdict
+        except CrashhuntError as error:
+            verdict = str(error)
+        assert verdict != "reproduced"
+        assert victim.read_text() == "mine"
+        if attack == "netstate-dump":  # it is the kernel that has held
+            replay(bundle, ReplayOptions(code="log", force=True, trusted=True))
+            assert "netstate" in victim.read_text()
 
 
 EVIL = 'from pathlib import Path\nPath("evil was here").touch()\n'

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from test_hunt_loop import TOY
@@ -105,6 +107,35 @@ def facts_of(hunt):
         return ledger.facts()
 
 
+@pytest.mark.long
+@pytest.mark.nightly
+def test_a_hunt_ends_with_its_first_crash_and_does_not_depend_on_how_many_run_at_a_time(tmp_path, monkeypatch, capfd):
+    # Hunting from a script without a guard: if a worker imported it again, this would run there.
+    (tmp_path / "script.py").write_text(f"print('again')\nopen({str(tmp_path / 'again')!r}, 'w')\n")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(tmp_path / "script.py"), raising=False)
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    found = {}
+    for parallel in (1, 3):
+        hunt = tmp_path / f"h{parallel}"
+        report = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)
+        assert report.stopped_because == "crash"
+        crash = min(report.crashes, key=lambda bundle: bundle.result.spec.number)
+        assert crash.confirmed
+        number = crash.result.spec.number
+        assert set(range(number + 1)) <= rows(hunt).keys()
+        assert all(rows(hunt)[before][0] == "survived" for before in range(number))
+        assert hunt_state(hunt).state == "crashed"
+        again = crashhunt.run(hunt, parallel, 30, 60, deterministic=True, **OPTIONS)  # states again what it found
+        assert [(one.id, one.confirmed) for one in again.crashes] == [(one.id, True) for one in report.crashes]
+        assert (again.stopped_because, again.outcomes) == ("crash", report.outcomes)
+        found[parallel] = number, crash.result.digest, [rows(hunt)[before] for before in range(number)]
+        assert (report.kinds, report.audit, report.to_json()["audit"]) == (None, None, None)
+        assert "kinds" not in report.to_json()
+    assert found[1] == found[3]
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "again").exists()
+
+
 @pytest.mark.parametrize(
     ("number", "kind", "says"),
     [
@@ -134,3 +165,46 @@ def test_a_hunt_whose_watcher_fails_records_why_it_ended(tmp_path):
         crashhunt.run(tmp_path / "h", 1, 3, 60, watch=watch, **OPTIONS)
     state = hunt_state(tmp_path / "h")
     assert (state.state, state.detail, state.damaged) == ("error", "RuntimeError: the screen is gone", False)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"until_rate": "0.3/trial", "most": 40},
+        {"trials": 20, "rare": True, "disturb": ["brake=0.02"], "arguments": {"speed": 9.0}},
+    ],
+    ids=["until a rate", "rare"],
+)
+def test_full_disk_under_a_hunt_for_a_rate_changes_no_number(tmp_path, monkeypatch, options):
+    words = {"trials": 0, "max_steps": 60, "keep_going": True, "keep": 1, **OPTIONS, **options}
+    whole = crashhunt.run(tmp_path / "whole", 1, **words)
+    recorded = 0
+    record = Ledger.record
+
+    def fill(ledger, result, *, snapshot):
+        nonlocal recorded
+        recorded += 1
+        if recorded > 4:
+            ledger._database.execute("PRAGMA max_page_count = 1")  # SQLite makes it the present size of the file
+        record(ledger, result, snapshot=snapshot)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Ledger, "record", fill)
+        with pytest.raises(
+            HuntDirectoryError, match=r"the disk is full \(.*\); free some space and run the same"
+        ) as caught:
+            crashhunt.run(tmp_path / "h", 1, **words)
+    assert "\n" not in str(caught.value)
+    state = hunt_state(tmp_path / "h")
+    assert (state.state, state.damaged) == ("error", False)
+    assert 4 <= state.trials_run < sum(whole.outcomes.values())
+    (checked,) = check(tmp_path / "h")
+    assert checked.fine
+    resumed = crashhunt.run(tmp_path / "h", 1, **words)
+    assert rows(tmp_path / "h") == rows(tmp_path / "whole")
+    assert resumed.outcomes == whole.outcomes
+    if whole.rate is not None:
+        assert resumed.rate == replace(whole.rate, dir=str(tmp_path / "h"))
+    if whole.rare is not None:
+        assert resumed.rare.estimate == whole.rare.estimate
