@@ -470,8 +470,9 @@ def test_what_keeps_a_case_from_running_is_its_result(run, tmp_path):
 
 
 def test_crash_is_kept_only_where_a_folder_is_given(run, tmp_path):
-    (found,) = run(Outcome.COLLISION, keep=tmp_path / "out")
-    assert found.kept == tmp_path / "out" / "0"
+    for _ in range(2):  # also into the folder of an earlier run
+        (found,) = run(Outcome.COLLISION, keep=tmp_path / "out")
+        assert found.kept == tmp_path / "out" / "0"
     assert (found.kept / "hunt.toml").read_text().startswith("# ")
     assert [path.name for path in (found.kept / "snapshots").iterdir()]
     (found,) = run(Outcome.SURVIVED, keep=tmp_path / "out")
