@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hypothesis import strategies as st
 
+from crashhunt.episode import run_episode
 from crashhunt.recording import (
     AgentChannel,
     BlackBox,
@@ -21,10 +23,13 @@ from crashhunt.recording import (
     encode_spines,
     read_black_box,
 )
+from crashhunt.trial import Outcome
 from crashhunt.world import Actor, Contact, Roster, Scene
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from crashhunt.trial import TrialResult, TrialSpec
 
 NAMES = ["ego", "left.25", "odd name/§ #1", "日本", "a.b"]
 
@@ -112,3 +117,15 @@ def record(episode: Episode, path: Path) -> Recording:
     """Write and read a black box."""
     write(episode, path)
     return Recording(read_black_box(path))
+
+
+def record_run(
+    path: Path, spec: TrialSpec, simulator: Any, agent: Any, **options: Any
+) -> tuple[TrialResult, Recording]:
+    """Run an episode with one agent; return its result and its recording."""
+    with closing(BlackBox(path)) as box:
+        box.begin(pid=1, trial=0, started=0.0)
+        result = run_episode(spec, simulator=simulator, make_agent=lambda *_: agent, box=box, **options)
+        recording = Recording(read_black_box(path))
+    assert result.outcome is Outcome.INVALID or result.digest == recording.digest
+    return result, recording

@@ -28,6 +28,21 @@ class Steady(Always):
         return self.speed, 0
 
 
+class Scripted:
+    """Does what a function of the step says, and has another function look at what it is shown."""
+
+    def __init__(self, act, look=id):
+        self._act, self._look, self._step = act, look, 0
+
+    def reset(self, seed):
+        self._step = 0
+
+    def act(self, observation):
+        self._look(observation)
+        self._step += 1
+        return self._act(self._step)
+
+
 class Watch(Observer):
     """Keeps scenes, and what takes place."""
 

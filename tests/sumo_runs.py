@@ -7,14 +7,15 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from crashhunt.episode import run_episode
-from crashhunt.recording import BlackBox, Recording, read_black_box
+from episodes import record_run
+
 from crashhunt.scenario import Scenario, argument_values, load_scenario
 from crashhunt.sumo import SumoSetup, SumoSimulator
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from crashhunt.recording import Recording
     from crashhunt.trial import TrialResult, TrialSpec
 
 
@@ -72,10 +73,4 @@ class SumoRuns(ExitStack):
         self, simulator: SumoSimulator, spec: TrialSpec, agent: Any, **options: Any
     ) -> tuple[TrialResult, Recording]:
         """Run an episode with one agent; return its result and its recording."""
-        file = self.folder() / "box"
-        with closing(BlackBox(file)) as box:
-            box.begin(pid=1, trial=0, started=0.0)
-            result = run_episode(spec, simulator=simulator, make_agent=lambda *_: agent, box=box, **options)
-            recording = Recording(read_black_box(file))
-        assert recording.digest == result.digest
-        return result, recording
+        return record_run(self.folder() / "box", spec, simulator, agent, **options)

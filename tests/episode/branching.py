@@ -29,12 +29,12 @@ class Place:
         self.given = argument_values(scenario) if scenario.arguments else {"gap_m": 12.0}
         self.box = BlackBox(stage / "blackbox.bin")
 
-    def run(self, brancher=None, agent=None, steps=None, **more):
+    def run(self, asking=None, agent=None, steps=None, **more):
         self.box.begin(pid=os.getpid(), trial=0, started=0.0)
         spec = TrialSpec(0, self.seed, {}, self.given, steps or self.steps, **more)
         return run_episode(
             spec, simulator=self.simulator, make_agent=lambda *_: agent or KeepLaneWithSpeed(self.speed), box=self.box,
-            oracles=[ReportedCollision(), Overlap()], asking=[brancher] if brancher else [],
+            oracles=[ReportedCollision(), Overlap()], asking=[asking] if asking else [],
         )  # fmt: skip
 
 

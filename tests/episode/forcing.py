@@ -8,23 +8,12 @@ from dataclasses import replace
 
 from branching import Place, Sleeps
 
-from crashhunt.agents import KeepLaneWithSpeed
 from crashhunt.base.processes import children_of
 from crashhunt.disturbances import disturber_of, first_forcing, parse_rates
-from crashhunt.episode import OnsetForcer, _forks as forks, run_episode
-from crashhunt.oracles import Overlap, ReportedCollision
-from crashhunt.trial import CRASHES, Forcing, TrialSpec
+from crashhunt.episode import OnsetForcer, _forks as forks
+from crashhunt.trial import CRASHES, Forcing
 
 RATES = ("brake=0.05", "late_observation=0.05", "stop=0.05", "unseen=0.05")
-
-
-def run(place, forcer=None, agent=None, **more):
-    place.box.begin(pid=os.getpid(), trial=0, started=0.0)
-    spec = TrialSpec(0, place.seed, {}, place.given, place.steps, **more)
-    return run_episode(
-        spec, simulator=place.simulator, make_agent=lambda *_: agent or KeepLaneWithSpeed(place.speed), box=place.box,
-        oracles=[ReportedCollision(), Overlap()], asking=[forcer] if forcer else [],
-    )  # fmt: skip
 
 
 def forcer_of(rates, waited=(), patience_s=30.0, tell=lambda _: None):
@@ -37,7 +26,7 @@ def sampler_of(place, rates):
 
 def cells_of(place, rates):
     """The cells of all first onsets in a root."""
-    return run(place, forcer_of(rates), forcing=first_forcing(sampler_of(place, rates), place.steps)).forced.masses
+    return place.run(forcer_of(rates), forcing=first_forcing(sampler_of(place, rates), place.steps)).forced.masses
 
 
 def roots(name, stage, speed, seed, steps, rates=RATES):
@@ -46,13 +35,13 @@ def roots(name, stage, speed, seed, steps, rates=RATES):
     sampler = sampler_of(place, rates)
     first = first_forcing(sampler, steps)
     early = tuple(one for one in sampler.draw(seed, 1) if one.step == 1)
-    plain, root = run(place, disturbances=early), run(place, forcer_of(rates), disturbances=early, forcing=first)
-    again = run(place, forcer_of(rates), disturbances=early, forcing=first)
-    starts = [run(place, disturbances=one.disturbances) for one in root.forced.copies if one.crash]
-    other = run(place, forcer_of(rates), forcing=replace(first, ratios={"stop=6.0": 4.0}))
+    plain, root = place.run(disturbances=early), place.run(forcer_of(rates), disturbances=early, forcing=first)
+    again = place.run(forcer_of(rates), disturbances=early, forcing=first)
+    starts = [place.run(disturbances=one.disturbances) for one in root.forced.copies if one.crash]
+    other = place.run(forcer_of(rates), forcing=replace(first, ratios={"stop=6.0": 4.0}))
     always = ("late_observation=0.05",)  # of the agent: each onset is effective
     law = replace(first_forcing(sampler_of(place, always), steps), second_spacing=0.1)
-    late = run(place, forcer_of(always), forcing=replace(law, second=tuple(cells_of(place, always)))).forced
+    late = place.run(forcer_of(always), forcing=replace(law, second=tuple(cells_of(place, always)))).forced
     return {
         "chance": sampler_of(place, always).chance("late_observation"),
         "late": [[one.onset, one.within, one.step] for one in late.copies if not one.second and not one.crash],
@@ -65,7 +54,7 @@ def roots(name, stage, speed, seed, steps, rates=RATES):
         "spacing": first.spacing,
         "other_steps": root.other_steps - (root.setup_steps or 0),
         "left": len(children_of(os.getpid())),
-        "plain": run(place, forcer_of(rates)).forced,
+        "plain": place.run(forcer_of(rates)).forced,
     }
 
 
@@ -74,7 +63,7 @@ def lost(stage):
     place, found = Place("toy", stage, 9.5, 2, 60), {}
     forcing, forks._PAUSES_S = Forcing(0.1), (0.0, 0.0)
     for name, how in {"hangs": lambda: time.sleep(600), "dies": lambda: os.kill(os.getpid(), 9)}.items():
-        result = run(place, forcer_of(RATES, patience_s=0.3), Sleeps(how), forcing=forcing)
+        result = place.run(forcer_of(RATES, patience_s=0.3), Sleeps(how), forcing=forcing)
         found[name] = [
             str(result.outcome), len(children_of(os.getpid())), result.is_fully_asked, result.is_to_be_run_again,
             result.forced.to_json(),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from episodes import record_run
 
-from crashhunt.episode import run_episode
 from crashhunt.oracles import Overlap, ReportedCollision
-from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import PARTS, layouts_of
 from crashhunt.simulators.toy import ToySimulator
@@ -40,26 +40,14 @@ class Counts:
 @pytest.fixture
 def run(tmp_path):
     """Runs an episode; returns its result and its recording."""
-    boxes = []
+    paths = (tmp_path / f"box{number}" for number in itertools.count())
 
     def run_it(*disturbances, scenario=ONE, steps=40, agent=None, **arguments):
-        boxes.append(BlackBox(tmp_path / f"box{len(boxes)}"))
-        boxes[-1].begin(pid=1, trial=0, started=0.0)
-        given = {"leader_speed": 10.0, **arguments}
-        result = run_episode(
-            TrialSpec(0, 1, {}, given, steps, disturbances=disturbances),
-            simulator=ToySimulator(scenario, tmp_path),
-            make_agent=lambda *_: agent or Counts(),
-            box=boxes[-1],
-            oracles=[ReportedCollision(), Overlap()],
-        )
-        recording = Recording(read_black_box(tmp_path / f"box{len(boxes) - 1}"))
-        assert recording.digest == result.digest
-        return result, recording
+        spec = TrialSpec(0, 1, {}, {"leader_speed": 10.0, **arguments}, steps, disturbances=disturbances)
+        simulator, oracles = ToySimulator(scenario, tmp_path), [ReportedCollision(), Overlap()]
+        return record_run(next(paths), spec, simulator, agent or Counts(), oracles=oracles)
 
-    yield run_it
-    for box in boxes:
-        box.close()
+    return run_it
 
 
 def planned(step, what="brake", who="ahead", strong=4.0, long=1.0, agent="ego"):
@@ -246,17 +234,8 @@ def test_what_fails_in_the_step_that_is_disturbed_is_disturbed(run):
     assert not result.disturbed
 
 
-def test_a_kind_that_the_simulator_cannot_do_makes_the_trial_invalid(run, tmp_path):
-    box = BlackBox(tmp_path / "b")
-    box.begin(pid=1, trial=0, started=0.0)
-    result = run_episode(
-        TrialSpec(0, 1, {}, {}, 5, disturbances=(planned(1, "fly"),)),
-        simulator=ToySimulator(ONE, tmp_path),
-        make_agent=lambda *_: Counts(),
-        box=box,
-        oracles=[],
-    )
-    box.close()
+def test_a_kind_that_the_simulator_cannot_do_makes_the_trial_invalid(run):
+    result, _ = run(planned(1, "fly"))
     assert result.outcome is Outcome.INVALID
     assert "does not support the disturbance 'fly'" in result.failure.message
 

@@ -11,6 +11,7 @@ import libsumo
 import numpy as np
 import pytest
 from conftest import mostly_nightly
+from onlookers import Scripted
 
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway._descriptor import HighwaySetup
@@ -28,20 +29,6 @@ ROUTES = """<routes>
 <route id="up" edges="south north"/>
 {traffic}
 </routes>"""
-
-
-class Script:
-    """Does what a function of the step says."""
-
-    def __init__(self, act):
-        self.acts, self.step = act, 0
-
-    def reset(self, seed):
-        self.step = 0
-
-    def act(self, observation):
-        self.step += 1
-        return self.acts(self.step)
 
 
 @pytest.fixture
@@ -62,7 +49,7 @@ def drive(sumo_runs):
         )
         oracles = [ReportedCollision(), Overlap(), OffRoad()]
         spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps)
-        result, recording = sumo_runs.record(simulator, spec, Script(act), oracles=oracles, crash_on=crash_on)
+        result, recording = sumo_runs.record(simulator, spec, Scripted(act), oracles=oracles, crash_on=crash_on)
         assert result.failure is None, result.failure.traceback
         told = [(step.step, event) for step in recording.all_steps if step.scene for event in step.scene.events]
         assert result.events == Counter(event.kind for _, event in told)

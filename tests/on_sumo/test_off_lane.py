@@ -9,6 +9,7 @@ import libsumo
 import numpy as np
 import pytest
 from conftest import mostly_nightly
+from onlookers import Scripted
 
 from crashhunt.oracles import OffRoad, Overlap, ReportedCollision, TooClose
 from crashhunt.scenario import AgentSetup
@@ -26,20 +27,9 @@ PLACES = """<additional><parkingArea id="park" lane="west_1" startPos="60" endPo
 endPos="90"/><containerStop id="box" lane="west_0" startPos="60" endPos="90"/>{more}</additional>"""
 
 
-class Acts:
-    """Does what a function of the step says."""
-
-    def __init__(self, act):
-        self.acts, self.step = act, 0
-
-    def reset(self, seed):
-        self.step = 0
-
-    def act(self, observation):
-        assert np.isfinite(observation).all()
-        assert np.abs(observation).max() < 1e6  # SUMO's word for "no value" is -1073741824
-        self.step += 1
-        return self.acts(self.step)
+def check(observation):
+    assert np.isfinite(observation).all()
+    assert np.abs(observation).max() < 1e6  # SUMO's word for "no value" is -1073741824
 
 
 @pytest.fixture
@@ -55,7 +45,7 @@ def drive(sumo_runs):
         )  # fmt: skip
         spec = TrialSpec(0, 1, {"ego": {}}, {}, max_steps=steps, disturbances=disturbances)
         oracles = [ReportedCollision(), Overlap(), OffRoad(), TooClose()]
-        found = sumo_runs.record(simulator, spec, Acts(act), oracles=oracles, crash_on=CRASHES)
+        found = sumo_runs.record(simulator, spec, Scripted(act, check), oracles=oracles, crash_on=CRASHES)
         assert not simulator.notices
         return found
 

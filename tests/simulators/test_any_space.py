@@ -13,22 +13,19 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import examples
+from episodes import record_run
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from crashhunt.base.foreign_code import ForeignError
-from crashhunt.episode import run_episode
 from crashhunt.errors import ActionError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import CrashRule, GymSetup
 from crashhunt.recording import (
-    BlackBox,
-    Recording,
     decode_value,
     describe_value,
     encode_value,
     first_divergence,
-    read_black_box,
     read_log,
     write_log,
 )
@@ -307,15 +304,8 @@ class TestPost(SimulatorContract):
 
 
 def drive(tmp_path, name, carrier):
-    box = BlackBox(tmp_path / name)
-    box.begin(pid=0, trial=0, started=0.0)
     simulator = post(tmp_path)
-    result = run_episode(
-        TrialSpec(0, 1, {}, {}, 10), simulator=simulator, make_agent=lambda *_: carrier, box=box, oracles=()
-    )
-    recording = Recording(read_black_box(tmp_path / name))
-    box.close()
-    return result, recording, simulator
+    return *record_run(tmp_path / name, TrialSpec(0, 1, {}, {}, 10), simulator, carrier, oracles=()), simulator
 
 
 def test_episode_of_any_spaces_is_recorded_shown_and_compared(tmp_path):
