@@ -270,7 +270,7 @@ class SumoEvents:
             agent=agent,
             what=what,
             others=others,
-            lane=self._lanes.get(agent, ""),
+            lane=scene.agent_lanes.get(agent) or self._lanes.get(agent, ""),
             x=x,
             y=y,
             speed=scene.speeds[row],

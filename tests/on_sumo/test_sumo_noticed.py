@@ -282,6 +282,15 @@ def test_teleports_are_those_of_agents_and_of_vehicles_near_them(events, sumo):
     assert (found[1].x, found[1].lane) == (None, "") or found[1].lane == ""
 
 
+def test_place_of_a_teleport_that_ends_in_its_own_step_is_the_place_before(events, sumo):
+    """The lane was that after the teleport, 20 m from the position."""
+    sumo.answers |= {"simulation_getStartingTeleportNumber": 1, "simulation_getStartingTeleportIDList": ("ego",)}
+    made = events()
+    made.resume(scene_of(0.0, {"ego": "e_0"}, ego=(5.0, 6.0, 0.0, 10.0)), 4, {"ego": ""})
+    (found,) = made.look(scene_of(0.5, {"ego": "f_0"}, ego=(25.0, 6.0, 0.0, 15.0)), ("ego",))
+    assert (found.x, found.speed, found.lane) == (5.0, 10.0, "e_0")
+
+
 @pytest.mark.parametrize(
     ("one", "two", "gap"),
     [
