@@ -223,17 +223,18 @@ def test_decision_depends_on_no_order(outcomes, seed):
     assert first.interval() == second.interval()
 
 
-def test_rate_at_the_bar_ends_undecided_once_it_certainly_is_near_it():
-    watch = BarWatch(RULE, 0.25, "trial", ("collision",))
+@pytest.mark.parametrize(("bar", "most"), [(0.25, 2500), (0.9, 200)])  # no rate is 20 % above the second
+def test_rate_at_the_bar_ends_undecided_once_it_certainly_is_near_it(bar, most):
+    watch = BarWatch(RULE, bar, "trial", ("collision",))
     for number in range(20_000):
-        watch.add(data(number, "survived" if number % 4 else "collision"))
+        watch.add(data(number, "survived" if number * (1 - bar) % 1 < 1 - bar else "collision"))
         if watch.decided_at is not None:
             break
     assert (watch.verdict, watch.decided_at) == ("undecided", number)
     assert watch.why_undecided == "the rate certainly is within 20 % of the bar, so more trials do not help"
     low, high = watch.interval()
-    assert 0.2 <= low < 0.25 < high <= 0.3
-    assert number < 2500
+    assert 0.8 * bar <= low < bar < high <= 1.2 * bar
+    assert number < most
 
 
 def test_many_invalid_trials_end_a_hunt_undecided_and_few_do_not():
