@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import one_in
-from programs import COMPILER, DRIVER
+from programs import COMPILER
 from simulated import Simulated, answers_in_python, observations
 
 pytest.importorskip("fmpy", reason="FMPy is not installed", exc_type=ImportError)
@@ -203,19 +203,6 @@ def test_an_fmu_that_does_not_fit_is_refused_in_one_line(tmp_path, options, tabl
     with pytest.raises(PluginError, match=re.escape(message)) as refused:
         FmuFactory(f"fmu:{fmu}").agent("ego", Simulated(), {}, folder=tmp_path, files={})
     assert "\n" not in str(refused.value)
-
-
-def test_a_hunt_with_an_fmu_has_the_digests_of_one_with_the_same_driver_in_python(toy):
-    build_fmu(toy.folder, 3)
-    (toy.folder / "driver.py").write_text(DRIVER, encoding="utf-8")
-    for name, agent in (("by_fmi", "fmu:./planner.fmu"), ("in_python", "driver:Driver")):
-        words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
-        toy.crashhunt("run", name, "1", "4", "60", "--scenario", "toy", "--seed", "5", *words)
-    table = [toy.crashhunt("trials", name, "--format", "csv").out.splitlines() for name in ("by_fmi", "in_python")]
-    place = table[0][0].split(",").index("digest")
-    by_fmi, in_python = ([line.split(",")[place] for line in lines[1:]] for lines in table)
-    assert by_fmi == in_python
-    assert len(set(by_fmi)) == 4
 
 
 def test_a_file_that_is_no_fmu_is_refused(tmp_path):

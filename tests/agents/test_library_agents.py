@@ -15,6 +15,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from built_fmus import build_fmu
 from compiled_libraries import IN_C, compile_library
 from gymnasium import spaces
 from programs import COMPILER, DRIVER
@@ -261,16 +262,20 @@ def results(folder):
         pytest.param("intersection", "60", marks=pytest.mark.nightly),
     ],
 )
-def test_a_hunt_with_a_library_has_the_digests_of_one_with_the_same_driver_in_python(toy, scenario, steps):
+def test_a_hunt_with_a_library_or_an_fmu_has_the_digests_of_one_with_the_same_driver_in_python(toy, scenario, steps):
     compile_library(toy.folder, words=("-DHARMLESS",))
-    (toy.folder / "planner.py").write_text(DRIVER, encoding="utf-8")
-    for name, agent in (("in_c", "lib:./libplanner.so"), ("in_python", "planner:Driver")):
+    (toy.folder / "driver.py").write_text(DRIVER, encoding="utf-8")
+    drivers = {"in_python": "driver:Driver", "in_c": "lib:./libplanner.so"}
+    if scenario == "toy" and find_spec("fmpy"):
+        build_fmu(toy.folder, 3)
+        drivers["by_fmi"] = "fmu:./planner.fmu"
+    for name, agent in drivers.items():
         words = ("--agent", agent, "--arg", "speed=8.0:20.0", "--keep-going")
         toy.crashhunt("run", name, "1", "4", steps, "--scenario", scenario, "--seed", "5", *words)
-    in_c, in_python = ([one["digest"] for one in results(toy.folder / name)] for name in ("in_c", "in_python"))
+    in_python, *others = ([one["digest"] for one in results(toy.folder / name)] for name in drivers)
     assert all(one["steps"] > 3 for one in results(toy.folder / "in_c"))
-    assert in_c == in_python
-    assert len(set(in_c)) == 4
+    assert others == [in_python] * len(others)
+    assert len(set(in_python)) == 4
 
 
 def hunted(toy, harm, *words):
