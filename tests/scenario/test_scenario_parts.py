@@ -222,7 +222,7 @@ def test_unknown_keys_are_kept_only_from_a_later_version(tmp_path):
 @pytest.mark.parametrize(
     ("agent", "joined"),
     [
-        ({"exec": ["./planner", "--mode", "a b"]}, {"agent": "exec:/town/planner --mode 'a b'"}),
+        ({"exec": ["./planner", "--rate=2.5", "a b"]}, {"agent": "exec:/town/planner --rate=2.5 'a b'"}),
         ({"exec": ["./planner"], "reuse": True}, {"agent": "exec:/town/planner", "reuse": True}),
         ({"lib": "./planner.so"}, {"agent": "lib:/town/planner.so"}),
     ],
