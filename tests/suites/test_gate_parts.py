@@ -181,6 +181,9 @@ def test_gate_warns_of_equal_commits_and_of_changes_that_it_leaves_out(work):
     assert cautions(work, ("", ""), " M mine.py") == []
     with pytest.raises(UsageError, match="'mine:Old' is a commit and 'mine:New' is an agent"):
         gate(work.folder, commits=("aaaa", "")).run(work.folder / "g")
+    for margin in (-0.01, 1):
+        with pytest.raises(UsageError, match=f"^--margin is {margin}; give a share from 0 to below 1"):
+            gate(work.folder, margin=margin).run(work.folder / "g")
 
 
 @pytest.mark.parametrize(
