@@ -144,8 +144,8 @@ def test_controlled_vehicle_is_what_ego_names(files):
     with pytest.raises(ScenarioError) as caught:
         choose_ego("", [], 0.0, HERE)
     assert caught.value.where == "town.sumocfg"
-    files[0].write_text("<routes")
-    with pytest.raises(ScenarioError) as caught:
+    files[0].write_text('<routes><vehicle id="a" depart="5"/>')
+    with pytest.raises(ScenarioError, match="not valid XML") as caught:
         chosen("any")
     assert caught.value.where == str(files[0])
 
@@ -168,7 +168,7 @@ def test_traffic_has_warnings_with_their_times():
     assert warned(surveyed(("a", 300))) == []
     (wait,) = warned(surveyed(("a", 301), begin_s=0.5))
     assert "step 601 (301 s)" in wait
-    assert "begin to 300 in town.sumocfg" in wait
+    assert wait.endswith("Fix: set begin to 300 in town.sumocfg")
     assert warned(surveyed(("a", 310), begin_s=10.0)) == []
     jam = {"since_s": 50.0, "standing": 7, "vehicles": 9}
     later = jam | {"since_s": 60.0, "standing": 5}

@@ -103,19 +103,6 @@ def test_a_demand_of_0_at_one_end_is_no_reason_to_refuse(town):
     assert candidates(refine(town(), [run([]), run([("a", 1.0), ("b", 2.0), ("c", 3.0)])])) == ["a", "b", "c"]
 
 
-def test_a_long_wait_is_reported_in_one_line(town):
-    late = run([("a", 1000.0), ("b", 1100.0)])
-    (note,) = [note for note in refine(town(step_length=0.5), [late]).notes if note.startswith("warning")]
-    assert "no vehicle enters before step 2000 (1000 s)" in note
-    assert note.endswith("Fix: set begin to 999 in town.sumocfg")
-    in_the_morning = run([("a", 25800.0), ("b", 25900.0)], begin_s=25200.0)
-    at = '<trip id="{}" depart="{}" from="south" to="east"/>'
-    morning = town(at.format("a", 25800) + at.format("b", 25900), begin=25200)
-    assert "before step 600 (25800 s)" in refine(morning, [in_the_morning]).notes[1]
-    soon = run([("a", 299.0), ("b", 300.0)])
-    assert not [note for note in refine(town(), [soon]).notes if note.startswith("warning")]
-
-
 def test_of_gridlocked_traffic_those_are_candidates_that_enter_before(town):
     jam = {"since_s": 150.0, "standing": 60, "vehicles": 62}
     entries = [(f"v{at}", float(at)) for at in range(0, 300, 10)]
@@ -163,10 +150,3 @@ def test_vehicles_of_a_flow_depart_as_often_as_it_is_written(tmp_path, rate, int
     assert _departure_of("a.b.2", [file]) == pytest.approx(20 + 2 * interval_s)
     assert _departure_of("alone", [file]) == 5
     assert _departure_of("a.b", [file]) == _departure_of("gone.1", [file]) == 0.0
-
-
-def test_vehicles_of_a_file_that_is_no_xml_are_not_passed_over(tmp_path):
-    (tmp_path / "r.rou.xml").write_text('<routes><vehicle id="a" depart="5"/>')
-    with pytest.raises(ScenarioError, match="not valid XML") as caught:
-        _departures([tmp_path / "r.rou.xml"])
-    assert caught.value.where == str(tmp_path / "r.rou.xml")
