@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 
 if TYPE_CHECKING:
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
 
 
 def add_agent_header(commands: Commands) -> None:
@@ -22,6 +22,6 @@ def add_agent_header(commands: Commands) -> None:
     header.set_defaults(command=_print_header)
 
 
-def _print_header(_options: Parsed, _words: list[str]) -> int:
+def _print_header(_options: CommandOptions, _words: list[str]) -> int:
     sys.stdout.write((layout.PACKAGE / "agents" / "crashhunt_agent.h").read_text(encoding="utf-8"))
     return 0

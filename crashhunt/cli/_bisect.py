@@ -12,7 +12,7 @@ from crashhunt.cli._common import add_build, add_crash, add_json, build_limit_s,
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.corpus import Got
 
 
@@ -41,7 +41,7 @@ def add_bisect(commands: Commands) -> None:
     bisect.set_defaults(command=_bisect)
 
 
-def _bisect(options: Parsed, _words: list[str]) -> int:
+def _bisect(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.corpus import bisect
 
     def show(revision: str, got: Got, why: str) -> None:

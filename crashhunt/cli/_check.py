@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, count_of
-from crashhunt.cli._common import Commands, Parsed, add_json
+from crashhunt.cli._common import CommandOptions, Commands, add_json
 
 if TYPE_CHECKING:
     from crashhunt.hunts import Checked
@@ -35,7 +35,7 @@ def add_check(commands: Commands) -> None:
     check.set_defaults(command=_check)
 
 
-def _check(options: Parsed, _words: list[str]) -> int:
+def _check(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.hunts import check, salvage
 
     found = check(options.directory)

@@ -48,7 +48,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What a command is added to; argparse has no other name for it."""
 
 
-class Parsed(argparse.Namespace):
+class CommandOptions(argparse.Namespace):
     """The values of a command's arguments, and the ways to print its answer."""
 
     json: bool  # whether to print one JSON object to stdout, and all other text to stderr
@@ -92,7 +92,7 @@ class Parser(argparse.ArgumentParser):
                 fix = f"see {self.prog} --help; if it is a file or folder, write ./{word}"
                 raise UsageError(f"there is no option {word!r}", fix=fix)
             before = word
-        found, rest = super().parse_known_args(args, Parsed() if namespace is None else namespace)
+        found, rest = super().parse_known_args(args, CommandOptions() if namespace is None else namespace)
         ends_in_list = next(
             (one for one in reversed(self._actions) if not one.option_strings and one.nargs == "*"), None
         )
@@ -450,7 +450,7 @@ def add_ci_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def tell(options: Parsed, summary: str, annotations: Sequence[str]) -> None:
+def tell(options: CommandOptions, summary: str, annotations: Sequence[str]) -> None:
     """Write the summary and print the annotations, if the user requested them.
 
     Raises:

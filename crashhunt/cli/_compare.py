@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crashhunt.base import layout
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import Commands, Parsed, add_json
+from crashhunt.cli._common import CommandOptions, Commands, add_json
 from crashhunt.plans import RATE_PERS
 
 
@@ -33,7 +33,7 @@ def add_compare(commands: Commands) -> None:
     compare.set_defaults(command=_compare)
 
 
-def _compare(options: Parsed, _words: list[str]) -> int:
+def _compare(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.report import comparison_page, describe_comparison
     from crashhunt.results import find_searches
     from crashhunt.statistics import compare

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from crashhunt.base.plugins import Group
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
 
     Completer = Callable[..., Iterable[str]]
 
@@ -41,7 +41,7 @@ def add_completion(commands: Commands) -> None:
     completion.set_defaults(command=_completion)
 
 
-def _completion(options: Parsed, _words: list[str]) -> int:
+def _completion(options: CommandOptions, _words: list[str]) -> int:
     from argcomplete.shell_integration import shellcode
 
     print(shellcode(["crashhunt"], shell=options.shell))
@@ -130,7 +130,7 @@ def _outcomes(*, crashes: bool) -> list[str]:
     return [str(outcome) for outcome in ((*CRASHES, *EVENTS) if crashes else Outcome)]
 
 
-def _crashes(parsed_args: Parsed, **_: object) -> list[str]:
+def _crashes(parsed_args: CommandOptions, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
     if not folder:
         return []
@@ -138,14 +138,14 @@ def _crashes(parsed_args: Parsed, **_: object) -> list[str]:
     return sorted(path.parent.name for place in places for path in Path(folder).glob(f"{place}/*/{layout.CRASH}"))
 
 
-def _runs(parsed_args: Parsed, **_: object) -> list[str]:
+def _runs(parsed_args: CommandOptions, **_: object) -> list[str]:
     folder = vars(parsed_args).get("directory")
     if not folder:
         return []
     return sorted(path.parent.relative_to(folder).as_posix() for path in Path(folder).glob(f"*/*/{layout.HUNT}"))
 
 
-def _arguments(parsed_args: Parsed, *, of_agents: bool) -> list[str]:
+def _arguments(parsed_args: CommandOptions, *, of_agents: bool) -> list[str]:
     """Return the arguments of the scenario, read only from its file, because a shell does not wait for long."""
     from crashhunt.scenario import configurations, shipped_folder
 

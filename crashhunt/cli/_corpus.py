@@ -23,7 +23,7 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
-    from crashhunt.cli._common import Commands, Parsed, Parser
+    from crashhunt.cli._common import CommandOptions, Commands, Parser
     from crashhunt.corpus import CaseReport
 
 
@@ -93,7 +93,7 @@ def _add_places(parser: Parser) -> None:
     parser.add_argument("places", metavar="CORPUS", type=Path, nargs="+", help="the folder of a corpus, or of a case")
 
 
-def _add(options: Parsed, _words: list[str]) -> int:
+def _add(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.corpus import add_case
     from crashhunt.crashes import list_bundles
 
@@ -139,7 +139,7 @@ def _note(note: str) -> str:
     return f", note {note!r}" if note else ""
 
 
-def _run(options: Parsed, _words: list[str]) -> int:
+def _run(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
     from crashhunt.corpus import find_cases, run_cases
     from crashhunt.report import corpus_annotations, corpus_summary
@@ -161,7 +161,7 @@ def _run(options: Parsed, _words: list[str]) -> int:
     return 0 if all(report.ok for report in reports) else 1
 
 
-def _trust_cases(cases: list[Path], options: Parsed) -> None:
+def _trust_cases(cases: list[Path], options: CommandOptions) -> None:
     """Check that every case is trusted before the first case runs; ask at the terminal once for each origin."""
     from crashhunt.corpus import untrusted_case
 
@@ -202,7 +202,7 @@ def _summary_of(reports: list[CaseReport], count: int) -> str:
     return "\n".join(lines)
 
 
-def _list(options: Parsed, _words: list[str]) -> int:
+def _list(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.corpus import find_cases, read_case
 
     cases = [read_case(path) for path in find_cases(options.places)]

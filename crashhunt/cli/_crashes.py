@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.cli._common import Commands, Parsed, Parser
+    from crashhunt.cli._common import CommandOptions, Commands, Parser
     from crashhunt.corpus import Case, KnownType
     from crashhunt.crashes import CauseGroup, Group, Groups, Signature
 
@@ -71,7 +71,7 @@ def add_known(parser: Parser) -> None:
     )  # fmt: skip
 
 
-def _crashes(options: Parsed, _words: list[str]) -> int:
+def _crashes(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.crashes import count_causes, group_crashes, join_causes, list_bundles, read_notes
     from crashhunt.report import describe_causes, describe_groups, describe_note, describe_types_by_version
     from crashhunt.results import crashes_by_version, dropped_crashes, find_hunts
@@ -185,7 +185,7 @@ class _Comparison:
         ]
 
 
-def compare_with_corpus(options: Parsed, cases: list[Case]) -> tuple[JsonObject, bool]:
+def compare_with_corpus(options: CommandOptions, cases: list[Case]) -> tuple[JsonObject, bool]:
     """Print the crash types of all hunts below the directory of a command, compared with a corpus.
 
     Returns:
@@ -204,7 +204,7 @@ def compare_with_corpus(options: Parsed, cases: list[Case]) -> tuple[JsonObject,
     return {"groups": comparison.to_json(), "not_compared": list(found.left_out)}, comparison.has_news
 
 
-def _divide_types(options: Parsed, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
+def _divide_types(options: CommandOptions, groups: Sequence[Group]) -> tuple[list[tuple[CauseGroup, ...]], bool]:
     """Return the crashes of each type, divided by cause, and whether the user has interrupted the division."""
     from crashhunt.analysis import divide_by_cause
     from crashhunt.base.signals import stop_requests
@@ -226,7 +226,7 @@ def _divide_types(options: Parsed, groups: Sequence[Group]) -> tuple[list[tuple[
         return divided, bool(stops)
 
 
-def checked_cases(options: Parsed) -> list[Case] | None:
+def checked_cases(options: CommandOptions) -> list[Case] | None:
     """Return the cases of the corpus of ``--known``; None without this option.
 
     Raises:
@@ -252,7 +252,7 @@ def checked_cases(options: Parsed) -> list[Case] | None:
     return [read_case(path) for path in find_cases([corpus])]
 
 
-def _print_groups(options: Parsed, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
+def _print_groups(options: CommandOptions, groups: Sequence[Group], known: dict[Signature, str] | None) -> None:
     from crashhunt.report import crash_annotations, crashes_summary, findings_of, write_sarif
 
     if options.sarif is None and options.summary is None and not options.annotate:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crashhunt.cli._common import DONE, Commands, Parsed, add_json, integer
+from crashhunt.cli._common import DONE, CommandOptions, Commands, add_json, integer
 
 if TYPE_CHECKING:
     from crashhunt.dashboard import Address
@@ -50,7 +50,7 @@ def add_dashboard(commands: Commands) -> None:
     dashboard.set_defaults(command=_dashboard)
 
 
-def _dashboard(options: Parsed, _words: list[str]) -> int:
+def _dashboard(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.dashboard import serve
 
     def announce(address: Address) -> None:

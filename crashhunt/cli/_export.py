@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import Commands, Parsed, add_crash, add_json, opened_crash, shown_progress
+from crashhunt.cli._common import CommandOptions, Commands, add_crash, add_json, opened_crash, shown_progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,7 +54,7 @@ def add_export(commands: Commands) -> None:
     export.set_defaults(command=_export)
 
 
-def _export(options: Parsed, _words: list[str]) -> int:
+def _export(options: CommandOptions, _words: list[str]) -> int:
     if options.form:
         return _convert(options)
     if options.recorded_agent:
@@ -76,7 +76,7 @@ def _export(options: Parsed, _words: list[str]) -> int:
     return 0
 
 
-def _convert(options: Parsed) -> int:
+def _convert(options: CommandOptions) -> int:
     from crashhunt.formats import write_commonroad, write_openscenario
 
     suffix = _FORMATS[options.form]

@@ -35,7 +35,7 @@ from crashhunt.cli._trust import add_trust
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.statistics import GateReport
     from crashhunt.suites import GateProgress, RunRequest
 
@@ -119,7 +119,7 @@ def add_gate(commands: Commands) -> None:
     gate.set_defaults(command=_gate)
 
 
-def _gate(options: Parsed, words: list[str]) -> int:
+def _gate(options: CommandOptions, words: list[str]) -> int:
     from crashhunt.report import describe_gate, gate_annotations, gate_summary, write_gate_junit
     from crashhunt.suites import Gate, GateVersion
 
@@ -178,7 +178,7 @@ def _margin(text: str) -> float:
         ) from None
 
 
-def _of_options(options: Parsed, folder: Path) -> dict[str, RunRequest]:
+def _of_options(options: CommandOptions, folder: Path) -> dict[str, RunRequest]:
     """Return the only hunt, as the options describe it."""
     from dataclasses import replace
 
@@ -194,7 +194,7 @@ def _of_options(options: Parsed, folder: Path) -> dict[str, RunRequest]:
     return {Path(scenario).stem or scenario: RunRequest(replace(request, scenario=scenario), str(folder))}
 
 
-def _of_suite(options: Parsed, words: list[str]) -> dict[str, RunRequest]:
+def _of_suite(options: CommandOptions, words: list[str]) -> dict[str, RunRequest]:
     """Return all runs of a suite by name."""
     from dataclasses import replace
 

@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
-from crashhunt.cli._common import Commands, Parsed, add_json, make_console
+from crashhunt.cli._common import CommandOptions, Commands, add_json, make_console
 
 if TYPE_CHECKING:
     from crashhunt.guide import FoundPage, Page
@@ -33,7 +33,7 @@ def add_guide(commands: Commands) -> None:
     guide.set_defaults(command=_guide)
 
 
-def _guide(options: Parsed, _words: list[str]) -> int:
+def _guide(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.guide import find_page, for_terminal, list_pages, search_pages
 
     words = " ".join(options.topic)

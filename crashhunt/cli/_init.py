@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import NoValidTrialError, UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import DONE, Commands, Parsed, add_json
+from crashhunt.cli._common import DONE, CommandOptions, Commands, add_json
 
 if TYPE_CHECKING:
     from crashhunt.base.json_types import Plain
@@ -66,7 +66,7 @@ def add_init(commands: Commands) -> None:
     init.set_defaults(command=_init)
 
 
-def _init(options: Parsed, _words: list[str]) -> int:
+def _init(options: CommandOptions, _words: list[str]) -> int:
     if options.xosc is not None:
         return _init_from_parameters(options)
     from crashhunt.sumo.maps import MapOptions, describe_place, make_scenario, parse_bbox
@@ -101,7 +101,7 @@ def _init(options: Parsed, _words: list[str]) -> int:
     return DONE
 
 
-def _init_from_parameters(options: Parsed) -> int:
+def _init_from_parameters(options: CommandOptions) -> int:
     """Make a scenario from an OpenSCENARIO file."""
     from crashhunt.formats import scenario_from_openscenario
 
@@ -124,7 +124,7 @@ def _init_from_parameters(options: Parsed) -> int:
     return DONE
 
 
-def _source(options: Parsed) -> MapSource:
+def _source(options: CommandOptions) -> MapSource:
     from crashhunt.sumo.maps import MapSource, parse_shape
 
     if options.grid:

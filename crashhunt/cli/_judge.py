@@ -19,7 +19,7 @@ from crashhunt.cli._common import (
 from crashhunt.cli._trust import add_trust, check_trust, run_trusted
 
 if TYPE_CHECKING:
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.crashes import Bundle
 
 
@@ -65,7 +65,7 @@ def add_judge(commands: Commands) -> None:
     judge.set_defaults(command=_judge)
 
 
-def _judge(options: Parsed, _words: list[str]) -> int:
+def _judge(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.analysis import check_numbers
     from crashhunt.base.signals import stop_requests
 
@@ -91,7 +91,7 @@ def _judge(options: Parsed, _words: list[str]) -> int:
     return INTERRUPTED if stops else DONE
 
 
-def _unjudged(options: Parsed) -> list[Bundle]:
+def _unjudged(options: CommandOptions) -> list[Bundle]:
     from crashhunt.crashes import judgement_of, list_bundles, partner
     from crashhunt.results import find_hunts
     from crashhunt.trial import Outcome
@@ -112,7 +112,7 @@ def _unjudged(options: Parsed) -> list[Bundle]:
 
 
 def _judge_one(
-    options: Parsed, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
+    options: CommandOptions, bundle: Bundle, stops: list[int], trusted: bool | None, *, write: bool
 ) -> dict[str, object]:
     from crashhunt.analysis import judge_bundle
     from crashhunt.crashes import judgement_of

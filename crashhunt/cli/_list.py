@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from crashhunt import report
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, one_line, visible
-from crashhunt.cli._common import Commands, Parsed, add_json
+from crashhunt.cli._common import CommandOptions, Commands, add_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ def with_list(words: Sequence[str]) -> list[str]:
     return ["list", *words] if words and words[0] in _KINDS else list(words)
 
 
-def _list(options: Parsed, _words: list[str]) -> int:
+def _list(options: CommandOptions, _words: list[str]) -> int:
     if options.copy is not None:
         return _copy(options)
     listed = {name: entries() for name, entries in _KINDS.items() if options.what in (None, name)}
@@ -70,7 +70,7 @@ def _list(options: Parsed, _words: list[str]) -> int:
     return 0
 
 
-def _copy(options: Parsed) -> int:
+def _copy(options: CommandOptions) -> int:
     from crashhunt.scenario import copy_shipped_scenario
 
     name, folder = options.copy

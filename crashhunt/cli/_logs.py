@@ -8,7 +8,7 @@ from pathlib import Path
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import one_line, visible
-from crashhunt.cli._common import Commands, GivenOnce, Parsed, chosen_runs, integer, refuse_below
+from crashhunt.cli._common import CommandOptions, Commands, GivenOnce, chosen_runs, integer, refuse_below
 
 
 def add_logs(commands: Commands) -> None:
@@ -39,7 +39,7 @@ def add_logs(commands: Commands) -> None:
     logs.set_defaults(command=_logs)
 
 
-def _logs(options: Parsed, _words: list[str]) -> int:
+def _logs(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.results import LogKind, LogReader, hunt_state
 
     if options.errors_only and options.type not in (None, "error"):

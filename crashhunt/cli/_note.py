@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, UsageError
 from crashhunt.base.text import count_of, listed
-from crashhunt.cli._common import DONE, Commands, CrashId, Parsed, add_json, hunt_of_bundle, integer, opened_hunt
+from crashhunt.cli._common import (
+    DONE,
+    CommandOptions,
+    Commands,
+    CrashId,
+    add_json,
+    hunt_of_bundle,
+    integer,
+    opened_hunt,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +63,7 @@ def add_note_command(commands: Commands) -> None:
     note.set_defaults(command=_note)
 
 
-def _note(options: Parsed, _words: list[str]) -> int:
+def _note(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.report import describe_note
 
     tags = [tag for given in options.tags for tag in given.split(",")]
@@ -94,13 +103,13 @@ def _nothing_found(words: str, known: Sequence[Note]) -> str:
     return f"no note of {count_of(len(known), 'note')} contains {words!r} ({'; '.join(what)})"
 
 
-def _added(options: Parsed, hunt: Path, crash: str, tags: list[str]) -> Note:
+def _added(options: CommandOptions, hunt: Path, crash: str, tags: list[str]) -> Note:
     from crashhunt.crashes import add_note
 
     return add_note(hunt, crash, " ".join(options.text), tags)
 
 
-def _removed(options: Parsed, hunt: Path, crash: str) -> list[Note]:
+def _removed(options: CommandOptions, hunt: Path, crash: str) -> list[Note]:
     """Remove the given notes; refuse all of them if one does not exist or is about another crash."""
     from crashhunt.crashes import read_notes, remove_note
 
@@ -114,7 +123,7 @@ def _removed(options: Parsed, hunt: Path, crash: str) -> list[Note]:
     return [remove_note(hunt, number) for number in missing or dict.fromkeys(options.remove)]
 
 
-def _subject(options: Parsed) -> tuple[Path, str]:
+def _subject(options: CommandOptions) -> tuple[Path, str]:
     """Return the directory of the hunt to change, and the name of the crash; empty for the whole hunt.
 
     Raises:
@@ -140,7 +149,7 @@ def _subject(options: Parsed) -> tuple[Path, str]:
     return directory, ""
 
 
-def _listed(options: Parsed) -> list[tuple[str, tuple[Note, ...]]]:
+def _listed(options: CommandOptions) -> list[tuple[str, tuple[Note, ...]]]:
     """Return the notes of each hunt in the directory, or of the crash that the user names."""
     from crashhunt.crashes import find_bundle, read_notes, subject_of
     from crashhunt.results import find_hunts

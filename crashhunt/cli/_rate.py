@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line
-from crashhunt.cli._common import DONE, NO_ANSWER, THE_ANSWER_IS_NO, Commands, GivenOnce, Parsed, add_json, number
+from crashhunt.cli._common import (
+    DONE,
+    NO_ANSWER,
+    THE_ANSWER_IS_NO,
+    CommandOptions,
+    Commands,
+    GivenOnce,
+    add_json,
+    number,
+)
 from crashhunt.plans import RATE_PERS
 
 if TYPE_CHECKING:
@@ -56,7 +65,7 @@ def add_rate(commands: Commands) -> None:
     rate.set_defaults(command=_rate)
 
 
-def _rate(options: Parsed, _words: list[str]) -> int:
+def _rate(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.plans import check_rate, rate_of
     from crashhunt.report import describe_rates, rates_page, write_rates_csv
     from crashhunt.results import find_searches

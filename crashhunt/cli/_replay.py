@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.cli._common import Commands, Parsed, Parser
+    from crashhunt.cli._common import CommandOptions, Commands, Parser
     from crashhunt.crashes import Bundle
     from crashhunt.recording import Recording
     from crashhunt.render import FilmOptions, Shot
@@ -91,7 +91,7 @@ def add_film_options(parser: Parser) -> None:
     )
 
 
-def film_options(options: Parsed) -> FilmOptions | None:
+def film_options(options: CommandOptions) -> FilmOptions | None:
     """Return the options of a film; None if the user wants no film.
 
     Raises:
@@ -162,7 +162,7 @@ def recorded_shot(bundle: Bundle) -> Shot:
     return _shot(bundle, bundle.recording(), bundle.result, {}, crashed=not bundle.is_near_miss)
 
 
-def write_films(options: Parsed, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
+def write_films(options: CommandOptions, shots: list[Shot], film: FilmOptions) -> dict[str, int]:
     """Write the requested films; return the number of pictures of each file.
 
     Raises:
@@ -316,7 +316,7 @@ def _add_inspection(replay: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _replay(options: Parsed, _words: list[str]) -> int:
+def _replay(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.replays import ReplayOptions
 
     chosen = ReplayOptions(
@@ -363,7 +363,7 @@ def _replay(options: Parsed, _words: list[str]) -> int:
     return 0 if good else 1
 
 
-def _replay_often(options: Parsed, chosen: ReplayOptions) -> int:
+def _replay_often(options: CommandOptions, chosen: ReplayOptions) -> int:
     """Replay one crash several times; after a Ctrl-C, report the replays that finished."""
     from crashhunt.base.signals import stop_requests
     from crashhunt.trial_reruns import StoppedError
@@ -387,7 +387,7 @@ def _replay_often(options: Parsed, chosen: ReplayOptions) -> int:
     return 0 if set(report.verdicts) == {options.expect} else 1
 
 
-def _refuse_what_would_be_ignored(options: Parsed, film: FilmOptions | None) -> None:
+def _refuse_what_would_be_ignored(options: CommandOptions, film: FilmOptions | None) -> None:
     """Refuse options that contradict each other, instead of ignoring one of them."""
     look = {
         "--gui": options.gui,
@@ -420,7 +420,7 @@ def _refuse_what_would_be_ignored(options: Parsed, film: FilmOptions | None) -> 
 
 
 def _replay_one(
-    options: Parsed,
+    options: CommandOptions,
     bundle: Bundle,
     chosen: ReplayOptions,
     stopped: Callable[[], bool] = lambda: False,
@@ -444,7 +444,7 @@ def _replay_one(
     return report, answer
 
 
-def _view_of(options: Parsed, bundle: Bundle) -> Look | None:
+def _view_of(options: CommandOptions, bundle: Bundle) -> Look | None:
     """Return the options of a debugged replay; None for a plain replay."""
     from crashhunt.replays import Look
 
@@ -468,7 +468,7 @@ def _view_of(options: Parsed, bundle: Bundle) -> Look | None:
     return Look(until=until, stop_at=until if options.pdb else 0, to_stderr=options.json) if until else None
 
 
-def _last_step(options: Parsed, bundle: Bundle) -> int:
+def _last_step(options: CommandOptions, bundle: Bundle) -> int:
     """Return the step at which to stop; 0 without ``--until`` or ``--before``."""
     crash, what = bundle.result.steps, "the crash is"
     if bundle.is_near_miss and (options.before is not None or options.pdb):

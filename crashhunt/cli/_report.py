@@ -14,7 +14,7 @@ from crashhunt.cli._common import add_crash, add_json, integer, opened_hunt, ref
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.crashes import Bundle
     from crashhunt.results import FoundCrashes
 
@@ -42,7 +42,7 @@ def add_report(commands: Commands) -> None:
     report.set_defaults(command=_report)
 
 
-def _report(options: Parsed, _words: list[str]) -> int:
+def _report(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.crashes import find_bundle, list_near_misses
     from crashhunt.report import write_report
     from crashhunt.results import find_crashes, hunt_state

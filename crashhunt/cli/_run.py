@@ -34,7 +34,7 @@ from crashhunt.cli._short_help import GROUPS, ShortHelp
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.hunts import HuntStatus
 
 _leave = os._exit  # which is refused to samplers, also while they are imported
@@ -75,7 +75,7 @@ def add_run(commands: Commands) -> None:
     run.set_defaults(command=_run)
 
 
-def _run(options: Parsed, words: list[str]) -> int:
+def _run(options: CommandOptions, words: list[str]) -> int:
     # Exit at once, because nothing has to be kept before the hunt takes over, and an import in user code could swallow
     # an exception.
     signal.signal(signal.SIGINT, lambda *_: _leave_at_once(as_json=options.json))
@@ -139,7 +139,7 @@ def _of_output(watch: Callable[[HuntStatus], None], descriptor: int) -> Callable
     return show
 
 
-def _start_wait_notice(options: Parsed) -> threading.Timer:
+def _start_wait_notice(options: CommandOptions) -> threading.Timer:
     """Return a timer that explains a long wait; the caller cancels it."""
 
     def tell() -> None:

@@ -13,8 +13,8 @@ from crashhunt.base.text import command_line
 from crashhunt.cli._common import (
     DONE,
     NO_ANSWER,
+    CommandOptions,
     Commands,
-    Parsed,
     WordsWithCommas,
     add_json,
     add_options,
@@ -59,7 +59,7 @@ def add_scorecard(commands: Commands) -> None:
     scorecard.set_defaults(command=_scorecard)
 
 
-def _scorecard(options: Parsed, _words: list[str]) -> int:
+def _scorecard(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.report import describe_scorecard, scorecard_page, scorecard_table
     from crashhunt.suites import run_scorecard
 

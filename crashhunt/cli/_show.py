@@ -7,7 +7,7 @@ from typing import Final
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import visible
-from crashhunt.cli._common import Commands, Parsed, add_crash, add_json, number, opened_crash
+from crashhunt.cli._common import CommandOptions, Commands, add_crash, add_json, number, opened_crash
 
 _MIN_BRAKING_MPS2: Final = 0.1
 
@@ -41,7 +41,7 @@ def add_show(commands: Commands) -> None:
     show.set_defaults(command=_show)
 
 
-def _show(options: Parsed, _words: list[str]) -> int:
+def _show(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.report import Story
 
     if not 0 < options.last_seconds < float("inf"):

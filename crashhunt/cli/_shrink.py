@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from crashhunt.analysis import Shrunk
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.crashes import Bundle
 
 _DEFAULT_TRIALS = 500
@@ -61,7 +61,7 @@ def add_shrink(commands: Commands) -> None:
     shrink.set_defaults(command=_shrink)
 
 
-def _shrink(options: Parsed, _words: list[str]) -> int:
+def _shrink(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.analysis import shrink
     from crashhunt.base.signals import stop_requests
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from crashhunt.base.text import aligned, visible
-from crashhunt.cli._common import Commands, Parsed, add_json, add_options, chosen_options
+from crashhunt.cli._common import CommandOptions, Commands, add_json, add_options, chosen_options
 
 _HUNT_OPTIONS = ("ego", "action", "observe", "agents", "arguments", "scenario_arguments")
 
@@ -27,7 +27,7 @@ def add_signals(commands: Commands) -> None:
 _ANY_STEPS = 1_000_000  # so that windows of requirements in the scenario fit; only one step runs
 
 
-def _signals(options: Parsed, _words: list[str]) -> int:
+def _signals(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.hunts import list_signals
     from crashhunt.plans import Request, plan
 

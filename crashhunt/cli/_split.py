@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from crashhunt.cli._common import DONE, Commands, Parsed, add_json
+from crashhunt.cli._common import DONE, CommandOptions, Commands, add_json
 
 _PARTS = ("training", "test")
 
@@ -33,7 +33,7 @@ def add_split(commands: Commands) -> None:
     split.set_defaults(command=_split)
 
 
-def _split(options: Parsed, _words: list[str]) -> int:
+def _split(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.training import check_test_share, split_crashes
 
     found = split_crashes(options.places, check_test_share(options.test, "--test"))

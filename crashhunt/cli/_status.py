@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crashhunt.base.text import count_of, one_line, out_of
-from crashhunt.cli._common import BAD_INPUT, DONE, Commands, Parsed, add_json, make_console
+from crashhunt.cli._common import BAD_INPUT, DONE, CommandOptions, Commands, add_json, make_console
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ def add_status(commands: Commands) -> None:
     status.set_defaults(command=_status)
 
 
-def _status(options: Parsed, _words: list[str]) -> int:
+def _status(options: CommandOptions, _words: list[str]) -> int:
     from rich.live import Live
 
     if options.json:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from crashhunt.base.codec import JsonObject
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
     from crashhunt.results import HuntState
 
 T = TypeVar("T")
@@ -99,7 +99,7 @@ def add_rerun(commands: Commands) -> None:
     rerun.set_defaults(command=_rerun)
 
 
-def _run(options: Parsed, _words: list[str]) -> int:
+def _run(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.results import find_hunts, hunt_state
     from crashhunt.suites import Suite, describe_finished
 
@@ -132,14 +132,14 @@ def _run(options: Parsed, _words: list[str]) -> int:
     return THE_ANSWER_IS_NO if options.fail_on_new and has_news else code
 
 
-def _defaults(_options: Parsed, _words: list[str]) -> int:
+def _defaults(_options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.suites import default_suite
 
     print(default_suite(), end="")
     return 0
 
 
-def _rerun(options: Parsed, _words: list[str]) -> int:
+def _rerun(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.suites import rerun
 
     hunts = list(chosen_runs(options.directory, options.run))
@@ -169,7 +169,7 @@ def _rerun(options: Parsed, _words: list[str]) -> int:
     )
 
 
-def run_with_trust(run: Callable[[bool], T], options: Parsed) -> T:
+def run_with_trust(run: Callable[[bool], T], options: CommandOptions) -> T:
     """Run hunts; ask at the terminal for each hunt that is not trusted, before the first hunt runs.
 
     Raises:

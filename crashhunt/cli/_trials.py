@@ -8,7 +8,7 @@ from pathlib import Path
 
 from crashhunt.base.errors import UsageError
 from crashhunt.base.text import command_line, one_of, visible
-from crashhunt.cli._common import Commands, Parsed, WordsWithCommas
+from crashhunt.cli._common import CommandOptions, Commands, WordsWithCommas
 
 
 def add_trials(commands: Commands) -> None:
@@ -37,7 +37,7 @@ def add_trials(commands: Commands) -> None:
     trials.set_defaults(command=_trials)
 
 
-def _trials(options: Parsed, _words: list[str]) -> int:
+def _trials(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.base.files import output_file
     from crashhunt.crashes import read_notes
     from crashhunt.report import describe_note

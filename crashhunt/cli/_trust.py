@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from crashhunt.base import layout
 from crashhunt.base.errors import BundleError, HuntDirectoryError, UntrustedError, UsageError
 from crashhunt.base.text import command_line, near_path, one_line
-from crashhunt.cli._common import Commands, Parsed, Parser, add_json
+from crashhunt.cli._common import CommandOptions, Commands, Parser, add_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,7 +42,7 @@ def add_trust_command(commands: Commands) -> None:
     trust.set_defaults(command=_trust)
 
 
-def _trust(options: Parsed, _words: list[str]) -> int:
+def _trust(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.crashes import list_trusted, remove_trusted
 
     if options.places and options.remove:
@@ -123,7 +123,7 @@ def run_trusted(
     run: Callable[[bool | None], T],
     bundle: Bundle,
     archive: Archive | None,
-    options: Parsed,
+    options: CommandOptions,
     *,
     path: Path | None = None,
 ) -> T:

@@ -25,7 +25,7 @@ from crashhunt.cli._trust import add_trust, run_trusted
 
 if TYPE_CHECKING:
     from crashhunt.analysis import Counts
-    from crashhunt.cli._common import Commands, Parsed
+    from crashhunt.cli._common import CommandOptions, Commands
 
 
 def add_whatif(commands: Commands) -> None:
@@ -104,7 +104,7 @@ def add_whatif(commands: Commands) -> None:
     whatif.set_defaults(command=_whatif)
 
 
-def _whatif(options: Parsed, _words: list[str]) -> int:
+def _whatif(options: CommandOptions, _words: list[str]) -> int:
     from crashhunt.base.signals import stop_requests
 
     refuse_below(options, times=1, parallel=0)

@@ -117,8 +117,8 @@ def test_pairs_are_divided_at_the_first_sign(words, named, found):
 
 
 def test_text_goes_to_stderr_if_json_is_printed(capsys):
-    _common.Parsed(json=False).answer("plain", {})
-    _common.Parsed(json=True).answer("beside", {"answer": 1})
+    _common.CommandOptions(json=False).answer("plain", {})
+    _common.CommandOptions(json=True).answer("beside", {"answer": 1})
     assert capsys.readouterr() == ('plain\n{"answer": 1}\n', "beside\n")
 
 
@@ -239,15 +239,15 @@ def test_progress_is_shown_on_a_terminal_if_no_json_is_printed(monkeypatch):
 def test_summary_is_added_to_its_file_and_annotations_are_printed_if_asked_for(tmp_path, capsys):
     place = tmp_path / "summary.md"
     for options in (
-        _common.Parsed(summary=place, annotate=True, json=False),
-        _common.Parsed(summary=place, annotate=False, json=False),
-        _common.Parsed(summary=None, annotate=True, json=True),
+        _common.CommandOptions(summary=place, annotate=True, json=False),
+        _common.CommandOptions(summary=place, annotate=False, json=False),
+        _common.CommandOptions(summary=None, annotate=True, json=True),
     ):
         _common.tell(options, "# yes", ["::one", "::two"])
     assert place.read_text() == "# yes\n# yes\n"
     assert capsys.readouterr() == ("::one\n::two\n", "::one\n::two\n")
     with pytest.raises(HuntDirectoryError, match="cannot be written"):
-        _common.tell(_common.Parsed(summary=tmp_path, annotate=False, json=False), "", [])
+        _common.tell(_common.CommandOptions(summary=tmp_path, annotate=False, json=False), "", [])
 
 
 def hunt_parser(names=()):

@@ -8,7 +8,7 @@ import pytest
 
 import crashhunt.suites
 from crashhunt.cli import _suite
-from crashhunt.cli._common import Parsed
+from crashhunt.cli._common import CommandOptions
 from crashhunt.results import HuntState
 
 
@@ -20,7 +20,9 @@ def rerun(tmp_path, monkeypatch):
         monkeypatch.setattr(crashhunt.suites, "rerun", work)
         monkeypatch.setattr(_suite, "chosen_runs", lambda directory, runs: [directory])
         monkeypatch.setattr(_suite, "chosen_of_machine", lambda options: {})
-        options = Parsed(directory=tmp_path, run=[], json=as_json, sets=[], all=False, to=None, parallel=0, trust=False)
+        options = CommandOptions(
+            directory=tmp_path, run=[], json=as_json, sets=[], all=False, to=None, parallel=0, trust=False
+        )
         return _suite._rerun(options, [])
 
     return run
