@@ -12,7 +12,8 @@ from crashhunt.base import layout
 from crashhunt.base.errors import BundleError
 from crashhunt.base.signals import describe_death
 from crashhunt.episode import scratch_of
-from crashhunt.executors._postmortem import MAX_ATTEMPTS, LostTrialError, read_map
+from crashhunt.executors._postmortem import read_map
+from crashhunt.executors._trial_attempts import MAX_ATTEMPTS, LostTrialError
 from crashhunt.recording import Recording, read_black_box
 from crashhunt.simulators import FullBraking
 from crashhunt.trial import Escape, TrialResult, TrialSpec

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 from crashhunt.base.errors import WorkerError
 from crashhunt.base.signals import describe_death
 from crashhunt.executors._fork_server_link import ForkServerLink
-from crashhunt.executors._postmortem import TrialAttempt, result_of_death, where_it_is
+from crashhunt.executors._postmortem import result_of_death
 from crashhunt.executors._protocol import Answer, Notes
+from crashhunt.executors._trial_attempts import TrialAttempt, where_it_is
 from crashhunt.trial import TrialResult
 
 if TYPE_CHECKING:

@@ -1,34 +1,28 @@
-"""Results of trials from what their processes left: a report that is checked first, or the files of a dead process."""
+"""Results of trials from the files that a dead process has left."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import struct
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from crashhunt.base import layout
-from crashhunt.base.errors import CrashhuntError, InternalError
 from crashhunt.base.exceptions import is_users
-from crashhunt.base.signals import is_sent_from_outside, signal_name
+from crashhunt.base.signals import signal_name
 from crashhunt.base.text import unescape_letters
 from crashhunt.episode import scratch_of
 from crashhunt.executors._native_stack import split_native_calls
-from crashhunt.executors._protocol import CHECKSUM_BYTES, Report, checksum_of
+from crashhunt.executors._trial_attempts import where_it_is
 from crashhunt.recording import (
     BlackBoxHeader,
     Phase,
     Recording,
-    Tag,
-    digest_of,
-    is_evidence,
     read_black_box,
-    read_header,
 )
 from crashhunt.trial import KILLED, Failure, Outcome, TrialResult, in_effect
 from crashhunt.world import DangerMeter, DrivenMeter, Lane, closest_approach, join_frames
@@ -36,8 +30,7 @@ from crashhunt.world import DangerMeter, DrivenMeter, Lane, closest_approach, jo
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from crashhunt.base.codec import JsonObject
-    from crashhunt.base.json_types import ErrorData
+    from crashhunt.executors._trial_attempts import TrialAttempt
     from crashhunt.trial import TrialSpec
     from crashhunt.world import Scene
 
@@ -45,19 +38,6 @@ if TYPE_CHECKING:
 _HEAD_BYTES, _TAIL_BYTES = 2000, 4000
 _MAX_NATIVE_BYTES = 1 << 16
 _FRAME_LINE = re.compile(r'  File "(.*)", line (\d+) in (.*)')  # of a stack that faulthandler wrote
-MAX_ATTEMPTS = 3  # of a trial whose process is killed from outside
-
-
-class LostTrialError(Exception):
-    """The process of a trial was killed from outside, or by an agent that attacked its zygote.
-
-    Args:
-        exit_code: exit code of the process; negative for a signal.
-    """
-
-    def __init__(self, exit_code: int) -> None:
-        super().__init__(exit_code)
-        self.exit_code = exit_code
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,51 +48,6 @@ class EndedTrial:
     notices: tuple[str, ...] = ()  # texts for the user
     # how the vehicle that collided brakes fully, and its deceleration; None if the settings do not request it
     braking: Mapping[str, object] | None = None
-
-
-@dataclass(slots=True)
-class TrialAttempt:
-    """A trial to run, and the record of how its processes have ended.
-
-    Certain signals may come from outside: from an administrator, from a batch system, or from the kernel if memory runs
-    out. After such a signal, the trial is run again, alone. If it ends in the same way at the same step, the trial
-    itself is the cause. If it ends at another step each time, the trial is not the cause. An end before the first step
-    is no evidence, because the process that forks trials may have been killed.
-    """
-
-    spec: TrialSpec  # the trial to run
-    # the signal and the step at which each process of the trial ended
-    ends: list[tuple[int, int]] = field(default_factory=list)
-    result: TrialResult | None = None  # result of the trial, while further trials search for its last avoidable step
-
-    @property
-    def alone(self) -> bool:
-        """Whether no other trial may run at the same time."""
-        return bool(self.ends)
-
-    @property
-    def is_killed_from_outside(self) -> bool:
-        """Whether every allowed attempt was killed at another step, so that the outcome of the trial is unknown."""
-        return len(self.ends) >= MAX_ATTEMPTS and len(set(self.ends)) == len(self.ends)
-
-    def again(self, scratch: Path, exit_code: int) -> str:
-        """Return the reason why the trial must run again, as text; empty if its outcome is known."""
-        if not is_sent_from_outside(exit_code):
-            return ""
-        header = where_it_is(scratch, self.spec.number)
-        end = exit_code, header.step if header is not None else -1
-        has_begun = header is not None and header.phase != Phase.SETUP
-        seen = end in self.ends and has_begun
-        self.ends.append(end)
-        if seen or len(self.ends) >= MAX_ATTEMPTS:
-            return ""
-        return f"trial {self.spec.number} was ended by {signal_name(exit_code)} from outside, and is run again"
-
-
-def where_it_is(scratch: Path, number: int) -> BlackBoxHeader | None:
-    """Return the progress of a running trial; None if it has not begun."""
-    header = read_header(scratch_of(scratch, number) / layout.BLACK_BOX)
-    return header if header is not None and header.trial == number else None
 
 
 def died(spec: TrialSpec, scratch: Path, exit_code: int, agents: Mapping[str, str] | None = None) -> TrialResult:
@@ -327,85 +262,3 @@ def _read_stack(path: Path) -> str:
         return ""
     native, rest = split_native_calls(text)
     return f"{native}{unescape_letters(rest[-_TAIL_BYTES:])}" if native else unescape_letters(read_ends(path))
-
-
-# What the process of a trial leaves behind when it ends, and whether it may be believed.
-#
-# That process runs code of the user, which may have bugs: it may write into files and memory that it does not own, or
-# fork and continue twice. So what it leaves is evidence: records in the black box, behind them one report with a
-# checksum, and an exit code. The supervisor accepts the report where all of them agree. An agent that forges its own
-# report on purpose harms only its own hunt, and is no concern here.
-
-_RECORD_HEAD = struct.Struct("<BxHI")  # of a record: tag, aux, length of its payload
-
-
-_REPORTED_FAULTS = (Outcome.AGENT_ERROR, Outcome.SIMULATOR_ERROR, Outcome.INVALID)
-
-
-def check_report(
-    report: bytes, *, spec: TrialSpec, header: BlackBoxHeader, records: bytes, pid: int
-) -> tuple[TrialResult, Report] | str:
-    """Check the report that the process of a trial wrote, and the trial's recording.
-
-    The report follows the committed records of the trial's black box. ``pid`` is the process that should have run the
-    trial.
-
-    Returns:
-        The result and the whole report, or a description of the first disagreement.
-
-    Raises:
-        InternalError: crashhunt itself failed in the trial's process.
-    """
-    evidence = _evidence_of(records)
-    if isinstance(evidence, str):
-        return evidence
-    if (header.trial, header.pid) != (spec.number, pid):
-        return f"it says that process {header.pid} ran trial {header.trial}"
-    digest = digest_of(evidence, of_changes=spec.digest_of_changes) if records else ""
-    text = report[CHECKSUM_BYTES:]
-    if report[:CHECKSUM_BYTES] != checksum_of(text):
-        return "its report was overwritten"
-    try:
-        loaded: JsonObject = json.loads(text)
-        if "fault" in loaded:
-            raise _fault_of(cast("ErrorData", loaded["fault"]))
-        said = cast("Report", loaded)
-        data = cast("JsonObject", {**said["result"], "spec": spec.to_json()})
-        result = TrialResult.from_json(data)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        return f"its report cannot be read ({type(error).__name__})"
-    # An episode that broke off while its observers were called has no digest in its result.
-    may_lack_digest = result.outcome in _REPORTED_FAULTS and not result.digest
-    if result.outcome is not Outcome.INVALID and result.digest != digest and not may_lack_digest:
-        return f"it reports the digest {result.digest or 'none'}, and its recording has {digest}"
-    return replace(result, spec=spec), said
-
-
-def _fault_of(data: ErrorData) -> CrashhuntError:
-    try:
-        return CrashhuntError.from_json(data)
-    except (KeyError, TypeError, AttributeError):
-        return InternalError("crashhunt itself failed in a trial, and its report cannot be read")
-
-
-def _evidence_of(records: bytes) -> list[memoryview] | str:
-    """Return the parts of the records that the digest covers, or the first error as text."""
-    whole, offset, end, begins = memoryview(records), 0, len(records), 0
-    evidence: list[memoryview] = []
-    while offset < end:
-        if offset + 8 > end:
-            return "its recording is cut off"
-        tag, _, length = _RECORD_HEAD.unpack_from(records, offset)
-        following = offset + 8 + length + (-length & 7)
-        if following > end:
-            return "its recording is cut off"
-        if (tag == Tag.PROLOGUE) != (offset == 0):
-            return "its recording does not begin with the prologue, or does twice"
-        if not is_evidence(tag):
-            evidence.append(whole[begins:offset])
-            begins = following
-        elif tag == 0:
-            return "its recording has an empty record"
-        offset = following
-    evidence.append(whole[begins:end])
-    return evidence

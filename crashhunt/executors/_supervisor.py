@@ -3,7 +3,7 @@
 A supervisor never runs foreign code.
 
 The supervisor owns the socket to the hunt, the black box, the scratch folder of the trial and its result.
-`check_report` in `_postmortem` checks the report and the recording that the process of a trial leaves.
+`_trial_report` checks the report and the recording that the process of a trial leaves.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from crashhunt.base.resources import limit_behind
 from crashhunt.base.signals import is_sent_from_outside
 from crashhunt.episode import internal_error, scratch_of
 from crashhunt.executors._escape_search import with_escape
-from crashhunt.executors._postmortem import EndedTrial, LostTrialError, check_report, damaged, died, hung, read_ends
+from crashhunt.executors._postmortem import EndedTrial, damaged, died, hung, read_ends
 from crashhunt.executors._time_limits import START_UP_S, PauseMeter, has_hung
+from crashhunt.executors._trial_attempts import LostTrialError
 from crashhunt.executors._trial_folder import TrialFolder
+from crashhunt.executors._trial_report import check_report
 from crashhunt.trial import TrialResult, TrialSpec
 
 if TYPE_CHECKING:

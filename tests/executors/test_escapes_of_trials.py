@@ -10,7 +10,7 @@ from crashhunt import crashes
 from crashhunt.base.errors import BundleError
 from crashhunt.executors import _escape_search, _trial_folder
 from crashhunt.executors._escape_search import with_escape
-from crashhunt.executors._postmortem import LostTrialError
+from crashhunt.executors._trial_attempts import LostTrialError
 from crashhunt.trial import Collision, Escape, Outcome, TrialResult, TrialSpec
 
 HIT = Collision("ego", "collider", "ego", "x", ("overlap",), "overlap", 1.0, 2.0)

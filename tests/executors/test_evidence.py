@@ -12,8 +12,9 @@ from toy_trials import settings_for
 from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.episode import Parts, run_episode
-from crashhunt.executors._postmortem import _fault_of, agent_in_stack, check_report
+from crashhunt.executors._postmortem import agent_in_stack
 from crashhunt.executors._protocol import encode_report
+from crashhunt.executors._trial_report import _fault_of, check_report
 from crashhunt.recording import BlackBox, BlackBoxFile, read_header
 from crashhunt.trial import Outcome, TrialSpec
 

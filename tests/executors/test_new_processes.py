@@ -17,7 +17,7 @@ from toy_trials import settings_for
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.executors import PoolExecutor, _fork_server_link, _fresh, _pool, _worker_environment
 from crashhunt.executors._fresh import FreshProcessExecutor
-from crashhunt.executors._postmortem import TrialAttempt
+from crashhunt.executors._trial_attempts import TrialAttempt
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 KILL = -signal.SIGKILL

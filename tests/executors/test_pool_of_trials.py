@@ -11,7 +11,7 @@ from toy_trials import settings_for
 
 from crashhunt.errors import CrashhuntError
 from crashhunt.executors import PoolExecutor, _fork_server_link
-from crashhunt.executors._postmortem import TrialAttempt
+from crashhunt.executors._trial_attempts import TrialAttempt
 from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 

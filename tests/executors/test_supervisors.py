@@ -20,9 +20,9 @@ from crashhunt.base import layout
 from crashhunt.base.errors import CrashhuntError, HostError
 from crashhunt.episode import Parts, run_episode, scratch_of
 from crashhunt.executors import _escape_search, _supervisor, _time_limits
-from crashhunt.executors._postmortem import LostTrialError
 from crashhunt.executors._protocol import encode_report
 from crashhunt.executors._supervisor import EndedTrial, Supervisor
+from crashhunt.executors._trial_attempts import LostTrialError
 from crashhunt.recording import BlackBox, Recording, read_black_box
 from crashhunt.scenario import AgentSetup
 from crashhunt.trial import CRASHES, Collision, Outcome, TrialResult, TrialSpec

@@ -16,9 +16,9 @@ from episodes import Episode, write
 from crashhunt.base import layout
 from crashhunt.episode import scratch_of
 from crashhunt.errors import PluginError, UsageError
-from crashhunt.executors import _postmortem, _preparation, _protocol, _time_limits
-from crashhunt.executors._postmortem import TrialAttempt
+from crashhunt.executors import _postmortem, _preparation, _protocol, _time_limits, _trial_attempts
 from crashhunt.executors._protocol import Notes
+from crashhunt.executors._trial_attempts import TrialAttempt
 from crashhunt.recording import Phase
 from crashhunt.trial import KILLED, Outcome, TrialSpec
 from crashhunt.world import Lane
@@ -159,7 +159,7 @@ def test_a_process_that_damaged_itself_is_an_error_of_its_only_agent(begun, phas
 def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch):
     steps = iter([3, 5, 9])
     monkeypatch.setattr(
-        _postmortem, "where_it_is", lambda *_: SimpleNamespace(step=next(steps), phase=Phase.ACT)
+        _trial_attempts, "where_it_is", lambda *_: SimpleNamespace(step=next(steps), phase=Phase.ACT)
     )  # fmt: skip
     attempt = TrialAttempt(SPEC)
     assert not attempt.alone
@@ -186,7 +186,7 @@ def test_a_trial_that_is_killed_from_outside_runs_again_alone(begun, monkeypatch
 @pytest.mark.parametrize("header", [None, SimpleNamespace(step=0, phase=Phase.SETUP)])
 def test_a_trial_that_is_killed_twice_before_its_first_step_has_a_third_attempt(begun, monkeypatch, header):
     """What forks the processes of trials may have been killed once: both attempts end with it."""
-    monkeypatch.setattr(_postmortem, "where_it_is", lambda *_: header)
+    monkeypatch.setattr(_trial_attempts, "where_it_is", lambda *_: header)
     attempt = TrialAttempt(SPEC)
     assert [bool(attempt.again(begun, KILL)) for _ in range(3)] == [True, True, False]
 
