@@ -43,6 +43,7 @@ _TESTS_ELSEWHERE = {
     # Tests of the accelerator compare it with highway-env through the simulator.
     "highway/accelerator": ("on_highway/accelerator/test_*.py", "on_highway/test_dynamic_*.py"),
     "agents/_program_logs.py": ("agents/test_programs.py",),
+    "agents/_fmu_agents.py": ("agents/test_fmu_agents.py", "agents/test_library_agents.py"),
     "agents/_reference_models.py": ("agents/test_competent_drivers.py", "testing/test_r157.py"),
     "agents/planners": ("agents/test_planner_adapters.py",),
     "api.py": ("test_python_calls.py", "e2e/test_api.py"),
