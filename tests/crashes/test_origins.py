@@ -224,37 +224,24 @@ def link_to_a_crash_of_another_user(place):
     shutil.copytree(place / "theirs" / "snapshots", place / "mine" / "snapshots", dirs_exist_ok=True)
 
 
-@attack
-def edited_arguments(place):
-    rewrite_crash(crash_of(place / "mine").path, arguments={"ego": {"weights": "/tmp/evil.npz", "speed": 6.0}})
+REWRITTEN = {  # of a crash.json
+    "edited_arguments": lambda place: {"arguments": {"ego": {"weights": "/tmp/evil.npz", "speed": 6.0}}},
+    "edited_seed": lambda place: {"seed": 77},
+    "proof_of_another_own_crash": lambda at: {"authentication_code": crash_of(at / "mine", 1).authentication_code},
+}  # fmt: skip
+for name, changes in REWRITTEN.items():
+    ATTACKS[name] = lambda place, of=changes: rewrite_crash(crash_of(place / "mine").path, **of(place))
 
 
-@attack
-def edited_seed(place):
-    rewrite_crash(crash_of(place / "mine").path, seed=77)
-
-
-@attack
-def proof_of_another_own_crash(place):
-    rewrite_crash(crash_of(place / "mine").path, authentication_code=crash_of(place / "mine", 1).authentication_code)
-
-
-@attack
-def agent_in_hunt_toml(place):
+def edit_settings(place, before, after):
     file = place / "mine" / "hunt.toml"
-    file.write_text(file.read_text().replace("mine_agents:Agent", "subprocess:Popen"))
+    assert before in file.read_text()
+    file.write_text(file.read_text().replace(before, after))
 
 
-@attack
-def oracle_in_hunt_toml(place):
-    file = place / "mine" / "hunt.toml"
-    file.write_text(file.read_text().replace('"overlap"', '"evil:Oracle"'))
-
-
-@attack
-def text_in_hunt_toml(place):
-    file = place / "mine" / "hunt.toml"
-    file.write_text(file.read_text().replace("a.npz|b.npz", "a.npz|/tmp/evil.npz"))
+for name, *edit in (("agent", "mine_agents:Agent", "subprocess:Popen"), ("oracle", '"overlap"', '"evil:Oracle"'),
+                    ("text", "a.npz|b.npz", "a.npz|/tmp/evil.npz")):  # fmt: skip
+    ATTACKS[f"{name}_in_hunt_toml"] = lambda place, edit=edit: edit_settings(place, *edit)
 
 
 @attack
@@ -276,8 +263,8 @@ def test_what_is_not_as_it_was_made_here_is_not_trusted(place, name):
 
 
 def test_numbers_in_hunt_toml_may_be_edited(place):
-    file = place / "mine" / "hunt.toml"
-    file.write_text(file.read_text().replace("max_steps = 99", "max_steps = 3").replace("5:9", "7:9"))
+    edit_settings(place, "max_steps = 99", "max_steps = 3")
+    edit_settings(place, "5.0:9.0", "7.0:9.0")
     assert is_bundle_trusted(crash_of(place / "mine"))
 
 
