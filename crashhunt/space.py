@@ -1,6 +1,6 @@
 """Spaces of arguments, for annotations of an agent's arguments: ``Annotated[float, Argument(...)]``."""
 
-from crashhunt.trial._argument_space import (
+from crashhunt.trial._argument_distributions import (
     Argument as Argument,
     Choice as Choice,
     Constant as Constant,

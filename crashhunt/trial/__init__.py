@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from crashhunt.base.doors import offer_lazily
 
 if TYPE_CHECKING:
-    from ._argument_space import (
+    from ._argument_distributions import (
         Argument as Argument,
         Choice as Choice,
         Constant as Constant,

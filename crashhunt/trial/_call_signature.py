@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 from crashhunt.base.errors import ArgumentError
 from crashhunt.base.foreign_code import supports
 from crashhunt.base.text import one_of
-from crashhunt.trial._argument_space import Argument, Kind, kind_of, parse_spec
+from crashhunt.trial._argument_distributions import Argument, Kind, kind_of, parse_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

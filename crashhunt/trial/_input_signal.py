@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from crashhunt.trial._argument_space import Value
+    from crashhunt.trial._argument_distributions import Value
 
 _PREFIX: Final = "signal:"
 _KINDS: Final = ("constant", "linear", "pchip")

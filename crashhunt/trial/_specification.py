@@ -18,7 +18,7 @@ from crashhunt.base.codec import (
 )
 from crashhunt.base.errors import CrashhuntError
 from crashhunt.base.version import __version__
-from crashhunt.trial._argument_space import Value
+from crashhunt.trial._argument_distributions import Value
 from crashhunt.trial._disturbance import Disturbance
 from crashhunt.world import Paths
 

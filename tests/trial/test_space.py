@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 
 from crashhunt.errors import ArgumentError
 from crashhunt.space import Choice, Constant, Range, Signature, parse_spec
-from crashhunt.trial._argument_space import Argument, kind_of
+from crashhunt.trial._argument_distributions import Argument, kind_of
 from crashhunt.trial._call_signature import CallSignature, signature_of
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64).filter(lambda x: abs(x) < 1e300)
