@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -15,14 +13,12 @@ from gymnasium import spaces
 
 from crashhunt.base.foreign_code import ForeignError
 from crashhunt.base.text import ABSENT_WORDS, NOTICE_TOPIC, PRESENT_WORDS
-from crashhunt.episode import Nearness
-from crashhunt.errors import ActionError, CrashhuntError, InvalidEpisodeError, ScenarioError
+from crashhunt.errors import CrashhuntError, InvalidEpisodeError, ScenarioError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import BACKEND, CrashRule, GymSetup
 from crashhunt.plans import Request, plan
 from crashhunt.scenario import AgentSetup, ArgumentSetup, Scenario
 from crashhunt.testing import SimulatorContract
-from crashhunt.trial import Outcome, TrialResult, TrialSpec
 
 
 class Tray(gymnasium.Env):
@@ -341,15 +337,6 @@ def test_error_of_an_old_gym_environment_is_the_same_inside_a_wrapper(tmp_path):
     )
 
 
-def test_a_flattened_action_has_the_type_of_its_space_or_is_refused(tmp_path):
-    form = simulator_of(tmp_path, "Tray-v0").actions["ball"]
-    encoded = form.encode(FALL)
-    again = form.encode(encoded.astype(np.float16))
-    assert (again.dtype, again.tolist()) == (encoded.dtype, encoded.tolist())
-    with pytest.raises(ActionError, match="is not in"):
-        form.encode(encoded.astype(complex))
-
-
 class Spaceless(Tray):
     observation_space = None
 
@@ -425,40 +412,8 @@ def test_a_hunt_reports_it_in_its_summary(shell):
     assert "Note: the environment 'straying:make_straying' shows its agent an observation outside" in done.err
 
 
-class Near(Tray):
-    def step(self, action):
-        *rest, info = super().step(action)
-        left = self.size - abs(self.ball).max()
-        return *rest, {
-            **info,
-            "left": left if self.steps != 2 else math.nan,
-            "share": 1 - left / self.size,
-        }
-
-
-gymnasium.register("Near-v0", entry_point=Near, disable_env_checker=True)
-
-
-@pytest.mark.parametrize(("danger", "most"), [("-info.left", 1 / 1.25), ("info.share", 0.875), ("info.other", None)])
-def test_where_no_scene_states_it_the_environment_names_its_danger(tmp_path, danger, most):
-    scenario = scenario_of("Near-v0")
-    simulator = GymSimulator(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), tmp_path)
-    for _ in range(2):  # of an episode, nothing is left in the next
-        simulator.reset(seed=1)
-        assert simulator.named_danger is None
-        nearness = Nearness(list)
-        nearness.begin(SimpleNamespace(names=("ball",), simulator=simulator))
-        simulator._env.unwrapped.ball[:] = 1.55
-        for tilt in (1.0, -1.0, -1.0):
-            action = simulator.actions["ball"].encode({"tilt": np.full(2, tilt, np.float32), "kick": 0})
-            simulator.step({"ball": action})
-        assert simulator.named_danger == (most and pytest.approx(most))
-        spec = TrialSpec(0, 1, {"ball": {}}, {}, max_steps=3)
-        assert nearness.end(TrialResult(spec, Outcome.SURVIVED)).danger == simulator.named_danger
-
-
 def test_danger_that_names_nothing_is_one_line():
-    scenario = scenario_of("Near-v0")
+    scenario = scenario_of("Tray-v0")
     for danger in ("distance", "info.", "-reward"):
         with pytest.raises(ScenarioError, match=f"gym.danger = '{danger}' is not of the form"):
             BACKEND.check(scenario.with_table(replace(scenario.table(GymSetup), danger=danger)), "scenario.toml")

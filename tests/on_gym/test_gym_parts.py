@@ -105,10 +105,11 @@ def test_structures_are_equal_where_their_numbers_are(one, other, same):
 
 def test_flat_action_is_inside_its_space_and_the_same_on_its_way_back():
     form = FlatAction(spaces.Dict(gear=spaces.Discrete(2), more=spaces.Box(0.0, 1.0, (1,), np.float64)))
-    for action in ({"gear": 1, "more": np.array([0.5])}, np.array([0.0, 1.0, 0.5])):
-        assert form.encode(action).tolist() == [0.0, 1.0, 0.5]
-    for action in (np.array([1.0, 1.0, 0.5]), np.array([0.0, 1.0, 1.5]), np.array([0.0, 1.0]), {"gear": 2},
-                   {"gear": 1, "more": np.ma.array([0.5], mask=[True])}, None):  # fmt: skip
+    flat = np.array([0.0, 1.0, 0.5])
+    for action in ({"gear": 1, "more": np.array([0.5])}, flat, flat.astype(np.float16)):
+        assert (form.encode(action).dtype, form.encode(action).tolist()) == (np.float64, [0.0, 1.0, 0.5])
+    for action in (flat.astype(complex), np.array([1.0, 1.0, 0.5]), np.array([0.0, 1.0, 1.5]), np.array([0.0, 1.0]),
+                   {"gear": 2}, {"gear": 1, "more": np.ma.array([0.5], mask=[True])}, None):  # fmt: skip
         with pytest.raises(ActionError, match="is not in Dict"):
             form.encode(action)
     assert _gymnasium.native(form, np.array([0.0, 1.0, 0.5]))["gear"] == 1
@@ -370,6 +371,7 @@ def test_named_danger_is_the_largest_of_an_episode(make, danger, values, found):
     made = make(danger)
     for _ in range(2):
         made.reset(seed=1)
+        assert made.named_danger is None
         for value in values:
             step(made, SEEN, 0.5, False, False, {} if value is None else {"d": value})
         assert made.named_danger == found
