@@ -152,7 +152,8 @@ def test_reset_begins_an_episode_of_its_seed_and_arguments_and_closes_the_one_be
     Episode.begins_with = ("a", "b")
     assert made.reset(8, {})[1] == {"sim_time_s": 0.0, "disturbances": ["a", "b"]}
     assert [one.closed for one in Episode.made] == [1, 0]
-    assert Episode.made[1].spec.scenario_arguments == {"cars": 3, "speed": 1.0}
+    spec = Episode.made[1].spec
+    assert (spec.seed, spec.scenario_arguments) == (8, {"cars": 3, "speed": 1.0})
     Episode.fails = SimulatorError("no road")
     with pytest.raises(SimulatorError, match="no road"):
         made.reset(9, {})

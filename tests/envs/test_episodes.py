@@ -82,29 +82,6 @@ def test_reward_is_the_distance_of_the_step(make):
     assert rewards[-1] == pytest.approx(0.5)
 
 
-def test_reset_repeats_an_episode_by_its_seed(make):
-    env = make("loop")
-    first, again, other = (
-        (env.reset(seed=seed)[0], *(step[0] for step in drive(env, (9.0, 0), 30))) for seed in (3, 3, 4)
-    )
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
-def test_arguments_of_an_episode_are_those_of_its_reset(make):
-    env = make("loop")
-    actors = []
-    for arguments in ({}, {"vehicles": 10}, {}):
-        env.reset(seed=3, options={"arguments": arguments})
-        actors.append(len(env._episodes._trail.scenes[-1].roster))
-    assert actors[1] < actors[0] == actors[2]
-
-
-def test_actions_are_those_that_were_chosen(make):
-    assert make("loop", action="meta").action_space.n == 5
-    assert len(make("loop", action="continuous").action_space) == 2  # speed and lane change
-
-
 def test_fork_of_a_process_has_no_simulation_of_its_own_yet(make, monkeypatch):
     monkeypatch.setattr("crashhunt.envs._sumo_env.RemoteEpisodes", lambda *words: Ended())
     monkeypatch.setattr("crashhunt.envs._sumo_env._here", weakref.WeakSet())
