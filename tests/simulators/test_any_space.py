@@ -32,6 +32,7 @@ from crashhunt.recording import (
 from crashhunt.recording._values import OpaqueValue
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.simulators import action_form, native
+from crashhunt.simulators._any_space import FlatAction, ObservationForm
 from crashhunt.testing import SimulatorContract
 from crashhunt.trial import TrialSpec
 
