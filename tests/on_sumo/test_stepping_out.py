@@ -82,7 +82,7 @@ def test_person_steps_out_as_fast_as_a_signal_and_is_back_in_time(drive):
     points = np.array(watch.of("person walker", "points"))
     moved = np.hypot(*np.diff(points[19:80], axis=0).T) / 0.1
     out = points[:, 1] - points[19, 1]
-    assert moved[:11] == pytest.approx(1.2)
+    assert moved[:11] == pytest.approx(watch.told[0].how_strong) == 1.2
     assert out[39] == pytest.approx(1.4)  # the 2 s of the last part suffice for 1.4 m back
     assert moved[20:40] == pytest.approx(0.0)
     assert moved[40:60] == pytest.approx(0.7)
