@@ -101,24 +101,6 @@ def test_the_one_that_is_ahead_brakes_and_drives_on_by_itself(begin):
     assert told.vehicle.startswith("vehicle.")
 
 
-def test_an_actor_cuts_in_and_no_one_into_a_side(begin):
-    episode, idle = begin(planned(2, "cut_in", "left ahead", 2.0, 3.0))
-    other = place(episode, 0, 15.0)
-    follow(episode, other, 16)
-    assert other.lane_index[2] == 1
-    assert idle.told[0].how_strong == 2.0
-    follow(episode, other, 2)
-    assert other.enable_lane_change
-    episode, idle = begin(planned(2, "cut_in", "left", 0.0, 1.0))
-    other = place(episode, 0, 1.0)
-    follow(episode, other, 6)
-    assert idle.told[0].vehicle
-    assert other.lane_index[2] == 0
-    episode, idle = begin(planned(2, "cut_in", "ahead", 2.0, 3.0))  # who is there already
-    follow(episode, place(episode, 1, 15.0), 3)
-    assert [one.vehicle for one in idle.told] == [""]
-
-
 @pytest.mark.parametrize("observation", [None, ObservationSetup(vehicles=3, features=("presence", "x", "y"))])
 def test_an_actor_is_not_seen_for_a_while(begin, observation):
     """Whoever makes the observation: highway-env itself, or crashhunt's own layout."""
