@@ -195,6 +195,9 @@ class UnitSequence:
             return f"all {self.other_code} trials ran with earlier code, or had begun when the code changed"
         if self._waiting:
             return f"trial {self._next} has not ended, and trials count in the order of their numbers"
+        if self._traffics:
+            trials = f"all of its {self._rule.trials_per_unit} trials"
+            return f"traffic {self._next} has not ended {trials}, and traffics count in the order of their numbers"
         return "no valid trial has finished"
 
     @property

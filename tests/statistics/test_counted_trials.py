@@ -327,6 +327,12 @@ def test_running_rate_names_the_trial_that_others_wait_for():
     assert watch.running(now=True)["why_not"].startswith("trial 0 has not ended")
     watch.add_facts(trial(0))
     assert watch.running(now=True)["crashes"] == 1
+    watch = RateWatch(CountingRule(max_steps=100, traffics=3, planned=6), "trial", ["collision"])
+    for number in (0, 1, 2, 4):
+        watch.add_facts(trial(number))
+    assert watch.running(now=True)["why_not"].startswith("traffic 0 has not ended all of its 2 trials, and traffics ")
+    watch.add_facts(trial(3))
+    assert (watch.running(now=True)["trials"], watch.running(now=True)["why_not"]) == (4, "")
 
 
 def test_running_rate_is_made_again_only_where_something_has_changed():
