@@ -181,8 +181,9 @@ def test_file_that_scenarios_share_is_copied_too(tmp_path, monkeypatch):
 
 def test_scenario_file_that_cannot_be_read_is_one_line(tmp_path):
     file = tmp_path / "scenario.toml"
-    file.write_text("schema = 1\n[agents.ego]\n[toy")
-    assert refusal(load_scenario, file)[0].startswith("not valid TOML: ")
+    for text in ("schema = 1\n[agents.ego]\n[toy", "\x00", "schema = 1\nschema = 1"):
+        file.write_text(text)
+        assert refusal(load_scenario, file)[0].startswith("not valid TOML: ")
     for key in ("folder", "file", "notes", "added"):
         file.write_text(f'schema = 1\nsimulator = "toy"\n{key} = 1\n')
         assert refusal(load_scenario, file)[:2] == (f"unknown key {key!r}", "remove it")
