@@ -10,6 +10,7 @@ This file imports only the standard library, because scripts/build_core.py runs 
 from __future__ import annotations
 
 import hashlib
+import re
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -25,11 +26,15 @@ _MODULES: Final = {
 
 
 def build_id(folder: Path) -> str:
-    """Return the digest of the C++ sources in a folder, as hexadecimal digits; empty if there are no sources."""
-    sources = sorted(folder.glob("*.?pp"))
+    """Return the digest of the C++ sources in a folder, as hexadecimal digits; empty if there are no sources.
+
+    Headers of other folders that they include belong to the sources.
+    """
+    contents = {source: source.read_bytes() for source in sorted(folder.glob("*.?pp"))}
+    elsewhere = sorted({name for content in contents.values() for name in re.findall(rb'"(\.\./[^"]+)"', content)})
+    sources = contents | {folder / name.decode(): (folder / name.decode()).read_bytes() for name in elsewhere}
     digest = hashlib.blake2b(digest_size=20)
-    for source in sources:
-        content = source.read_bytes()
+    for source, content in sources.items():
         digest.update(f"{source.name} {len(content)}\n".encode() + content)
     return digest.hexdigest() if sources else ""
 

@@ -61,8 +61,8 @@ PyGetSetDef columns_getters[] = {
     {"recorded", columns_recorded, nullptr, "The numbers as they are recorded.", nullptr},
     {nullptr, nullptr, nullptr, nullptr, nullptr},
 };
+
 PyMethodDef no_methods[] = {{nullptr, nullptr, 0, nullptr}};
-PyGetSetDef no_getters[] = {{nullptr, nullptr, nullptr, nullptr, nullptr}};
 
 PyMethodDef functions[] = {
     {"bind", FUNCTION(bind), "Find libsumo's functions in its library, given by its path."},
@@ -79,34 +79,6 @@ PyMethodDef functions[] = {
     {"changes_of", FUNCTION(changes_of), "Return where two arrays of words differ, and the changed words."},
     {nullptr, nullptr, 0, nullptr},
 };
-
-// Adds a class to the module; Python can make objects of it if it has a constructor. Never given back: columns may
-// outlive the module.
-PyTypeObject *add_class(PyObject *module, const char *name, size_t size, newfunc create, destructor destroy,
-                        PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
-    PyType_Slot slots[] = {
-        {Py_tp_dealloc, reinterpret_cast<void *>(destroy)},
-        {Py_tp_methods, methods},
-        {Py_tp_getset, getters},
-        {Py_tp_doc, const_cast<char *>(about)},
-        {create ? Py_tp_new : 0, reinterpret_cast<void *>(create)},
-        {0, nullptr},
-    };
-    const unsigned flags = Py_TPFLAGS_DEFAULT | (create ? 0 : Py_TPFLAGS_DISALLOW_INSTANTIATION);
-    PyType_Spec spec = {name, static_cast<int>(size), 0, static_cast<unsigned>(flags), slots};
-    PyObject *type = PyType_FromSpec(&spec);
-    if (!type || PyModule_AddObjectRef(module, strrchr(name, '.') + 1, type) < 0) {
-        Py_XDECREF(type);
-        throw Raised();
-    }
-    return reinterpret_cast<PyTypeObject *>(type);
-}
-
-template <typename Object, auto held, auto make>
-PyTypeObject *add_class(PyObject *module, const char *name, PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
-    typedef Class<Object, held, make> Made;
-    return add_class(module, name, sizeof(Object), Made::create, Made::destroy, methods, getters, about);
-}
 
 int fill(PyObject *module) {
     try {

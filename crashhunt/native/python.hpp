@@ -1,10 +1,11 @@
-// Functions for Python, whose arguments and results are converted by their C++ types. A part of core.cpp.
+// Functions for Python, whose arguments and results are converted by their C++ types. A part of core.cpp, and of the kernel
+// for highway-env.
 
 // Thrown where an exception of Python is set.
 struct Raised {};
 
-[[noreturn]] void raise(PyObject *kind, const char *message) {
-    PyErr_SetString(kind, message);
+template <typename... Values> [[noreturn]] void raise(PyObject *kind, const char *format, Values... values) {
+    PyErr_Format(kind, format, values...);
     throw Raised();
 }
 
@@ -115,8 +116,7 @@ template <> struct From<std::string> {
 template <PyTypeObject *type> struct From<Exact<type>> {
     static Exact<type> of(PyObject *given) {
         if (Py_TYPE(given) != type) {
-            PyErr_Format(PyExc_TypeError, "this is no %s", type->tp_name);
-            throw Raised();
+            raise(PyExc_TypeError, "this is no %s", type->tp_name);
         }
         return {given};
     }
@@ -128,8 +128,7 @@ template <typename... Values> struct From<std::tuple<Values...>> {
     }
     static std::tuple<Values...> of(PyObject *const *given, Py_ssize_t count) {
         if (count != sizeof...(Values)) {
-            PyErr_Format(PyExc_TypeError, "%zd values are given instead of %zu", count, sizeof...(Values));
-            throw Raised();
+            raise(PyExc_TypeError, "%zd values are given instead of %zu", count, sizeof...(Values));
         }
         return each(given, std::index_sequence_for<Values...>());
     }
@@ -151,14 +150,14 @@ template <typename Value> struct From<std::vector<Value>> {
 };
 
 // A result as a new object; null with an exception.
-PyObject *to_python(PyObject *made) { return made; }
-PyObject *to_python(bool value) { return PyBool_FromLong(value); }
-PyObject *to_python(int value) { return PyLong_FromLong(value); }
-PyObject *to_python(long long value) { return PyLong_FromLongLong(value); }
-PyObject *to_python(size_t value) { return PyLong_FromSize_t(value); }
-PyObject *to_python(double value) { return PyFloat_FromDouble(value); }
-PyObject *to_python(const std::string &value) { return text_of(value); }
-PyObject *to_python(const Ref &value) { return Py_XNewRef(value.object); }
+inline PyObject *to_python(PyObject *made) { return made; }
+inline PyObject *to_python(bool value) { return PyBool_FromLong(value); }
+inline PyObject *to_python(int value) { return PyLong_FromLong(value); }
+inline PyObject *to_python(long long value) { return PyLong_FromLongLong(value); }
+inline PyObject *to_python(size_t value) { return PyLong_FromSize_t(value); }
+inline PyObject *to_python(double value) { return PyFloat_FromDouble(value); }
+inline PyObject *to_python(const std::string &value) { return text_of(value); }
+inline PyObject *to_python(const Ref &value) { return Py_XNewRef(value.object); }
 template <typename... Values> PyObject *to_python(const std::tuple<Values...> &values);
 template <typename Value> PyObject *to_python(const std::vector<Value> &values);
 template <typename Value> PyObject *to_python(const std::optional<Value> &value) {
@@ -248,3 +247,33 @@ struct Class<Object, held, make> {
         Py_DECREF(type);
     }
 };
+
+PyGetSetDef no_getters[] = {{nullptr, nullptr, nullptr, nullptr, nullptr}};
+
+// Adds a class to the module; Python can make objects of it if it has a constructor. Never given back: columns may
+// outlive the module.
+PyTypeObject *add_class(PyObject *module, const char *name, size_t size, newfunc create, destructor destroy,
+                        PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
+    PyType_Slot slots[] = {
+        {Py_tp_dealloc, reinterpret_cast<void *>(destroy)},
+        {Py_tp_methods, methods},
+        {Py_tp_getset, getters},
+        {Py_tp_doc, const_cast<char *>(about)},
+        {create ? Py_tp_new : 0, reinterpret_cast<void *>(create)},
+        {0, nullptr},
+    };
+    const unsigned flags = Py_TPFLAGS_DEFAULT | (create ? 0 : Py_TPFLAGS_DISALLOW_INSTANTIATION);
+    PyType_Spec spec = {name, static_cast<int>(size), 0, static_cast<unsigned>(flags), slots};
+    PyObject *type = PyType_FromSpec(&spec);
+    if (!type || PyModule_AddObjectRef(module, strrchr(name, '.') + 1, type) < 0) {
+        Py_XDECREF(type);
+        throw Raised();
+    }
+    return reinterpret_cast<PyTypeObject *>(type);
+}
+
+template <typename Object, auto held, auto make>
+PyTypeObject *add_class(PyObject *module, const char *name, PyMethodDef *methods, PyGetSetDef *getters, const char *about) {
+    typedef Class<Object, held, make> Made;
+    return add_class(module, name, sizeof(Object), Made::create, Made::destroy, methods, getters, about);
+}

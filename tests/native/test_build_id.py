@@ -40,6 +40,16 @@ def test_module_of_other_sources_is_outdated(checkout, change):
     assert _build_id.outdated_modules(checkout) == ["_crashhunt_core"]
 
 
+def test_header_of_another_folder_is_a_source_of_those_that_include_it(checkout):
+    before = _build_id.build_id(checkout / "accelerator")
+    (checkout / "accelerator" / "part.cpp").write_text('#include "../native/part.hpp"')
+    digests = []
+    for text in ("int c;", "int d;"):
+        (checkout / "native" / "part.hpp").write_text(text)
+        digests.append(_build_id.build_id(checkout / "accelerator"))
+    assert len({before, *digests}) == 3
+
+
 def test_python_file_changes_no_build_id(checkout):
     (checkout / "native" / "part.py").write_text("x = 1")
     assert _build_id.outdated_modules(checkout) == []

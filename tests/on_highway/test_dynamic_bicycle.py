@@ -175,8 +175,9 @@ def test_rounding_of_numpy_is_found_out():
         def bind_turn(self, rounds):
             self.rounds = rounds
 
-        def compute(self, name, a, b, c, d):
+        def compute(self, name, numbers):
             assert name == "turned"
+            a, b, c, d = numbers
             found = float((np.array(((a, b), (-b, a))) @ np.array([c, d]))[0])
             return found if self.rounds == self.right else math.nextafter(found, 1e300)
 

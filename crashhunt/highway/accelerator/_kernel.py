@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 _MODULE = "_crashhunt_highway"
-_INTERFACE = 5
+_INTERFACE = 6
 
 
 class Traffic(Protocol):
@@ -73,10 +73,10 @@ class Traffic(Protocol):
         """Return all objects that `Road.close_objects_to` finds; None if the road does not have the vehicle."""
 
     def describe(
-        self, cells: NDArray[np.float64], observer: RoadObject | None, objects: list[RoadObject], features: bytes,
+        self, cells: NDArray[np.float64], objects: list[RoadObject], absolute: int, features: bytes,
         scales: array[float], clips: bool, /,
     ) -> bool:  # fmt: skip
-        """Write a row of features for each object, from the point of view of the observer if there is one.
+        """Write a row of features for each object, from the point of view of the first, but for some absolute rows.
 
         Returns:
             Whether all rows were written; False if highway-env's own code must run, such as for an error in a route.
@@ -116,7 +116,7 @@ class _Module(Protocol):
 
     def mirrored_poses(self, things: list[Any], halves: list[float], /) -> Poses | None: ...
 
-    def compute(self, name: str, /, *numbers: float) -> float: ...
+    def compute(self, name: str, numbers: tuple[float, ...], /) -> float: ...
 
 
 @cache
@@ -159,7 +159,7 @@ def _bind_turn(module: _Module) -> None:
     for rounds in (3, 2, 1, 0):
         module.bind_turn(rounds)
         if rounds == 0 or all(
-            module.compute("turned", *row, c, d).hex() == float(value).hex()
+            module.compute("turned", (*row, c, d)).hex() == float(value).hex()
             for (a, b, c, d), values in zip(numbers, right, strict=True)
             for row, value in zip(((a, b), (-b, a)), values, strict=True)
         ):
@@ -221,6 +221,6 @@ def _differs(module: _Module) -> str:
     ]
     for name, function, arguments in checks:
         for values in arguments:
-            if module.compute(name, *values).hex() != float(function(*values)).hex():
+            if module.compute(name, values).hex() != float(function(*values)).hex():
                 return name
     return ""

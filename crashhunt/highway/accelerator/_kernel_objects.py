@@ -39,6 +39,7 @@ _PARAMETER_READERS: dict[str, Callable[[RoadObject], Row]] = {
     how: attrgetter(*names) for how, names in NUMBERS_OF.items()
 }
 _READ_DELTA = attrgetter("DELTA")
+_FLOAT = np.dtype(np.float64)
 assert all(_PARAMETERS[: len(names)] == names for names in NUMBERS_OF.values())
 
 
@@ -78,7 +79,7 @@ class KernelObjects:
 
     def _in_kernel(self, road: Road, things: list[RoadObject], network: Network) -> Traffic | None:
         module, kinds = kernel(), self.kinds
-        if module is None or not all(kind.collides for kind in kinds) or not _are_plain(things, kinds):
+        if module is None or not all(kind.collides for kind in kinds) or not are_plain(things, kinds):
             return None
         count = len(road.vehicles)
         # Drivers evaluate a vehicle among the objects like a vehicle, which the kernel does not know.
@@ -95,7 +96,7 @@ class KernelObjects:
         return module.Traffic(lanes, things, bytes(models), flags, parameters, road, fixed, _examples(things, kinds))
 
 
-def _are_plain(things: list[RoadObject], kinds: list[VehicleClass]) -> bool:
+def are_plain(things: list[RoadObject], kinds: list[VehicleClass]) -> bool:
     """Return whether all positions have the usual type, no objects share an array, and no object occurs twice."""
     if not all(kind.plain for kind in kinds):
         return False
@@ -105,7 +106,8 @@ def _are_plain(things: list[RoadObject], kinds: list[VehicleClass]) -> bool:
 
 def _is_place(position: NDArray[np.float64]) -> bool:
     # An unpickled array has an equal dtype that is another object.
-    return type(position) is np.ndarray and position.dtype == np.float64 and position.shape == (2,)
+    is_array = type(position) is np.ndarray and (position.dtype is _FLOAT or position.dtype == _FLOAT)
+    return is_array and position.shape == (2,)
 
 
 def _examples(things: list[RoadObject], kinds: list[VehicleClass]) -> list[tuple[RoadObject, tuple[str, ...]]]:

@@ -13,7 +13,8 @@ from highway_env import utils
 from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.kinematics import Vehicle
 
-from crashhunt.highway.accelerator._supported import are_numbers, kind_of
+from crashhunt.highway.accelerator._kernel_objects import are_plain
+from crashhunt.highway.accelerator._supported import are_numbers, kind_of, kinds_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,6 +40,7 @@ _LANE_FEATURES = ("long_off", "lat_off", "ang_off")
 _DESTINATION_FEATURES = ("cos_d", "sin_d")
 _UNCOMPILED_FEATURES = frozenset((*_LANE_FEATURES, *_DESTINATION_FEATURES))
 """The features that highway-env's own code computes."""
+_KNOWN_FEATURES = _UNCOMPILED_FEATURES.union(_CODES)
 
 
 def close_objects(
@@ -111,28 +113,39 @@ def _visible_rows(
     if scales is None:
         return None
     shown = np.zeros((kinematic.vehicles_count, len(features)))
-    codes = bytes(_CODES.get(name, 0) for name in features)
-    describe, clip = state.traffic.describe, bool(kinematic.clip)
-    observer = None if kinematic.absolute else vehicle
-    if not describe(shown, None, [vehicle], codes, scales, clip) or not describe(
-        shown[1:], observer, close, codes, scales, clip
-    ):
+    codes = bytes([_CODES.get(name, 0) for name in features])
+    clip, things = bool(kinematic.clip), [vehicle, *close]
+    absolute = len(things) if kinematic.absolute else 1
+    if not state.traffic.describe(shown, things, absolute, codes, scales, clip):
         return None
     if kinematic.normalize:
         kinematic.features_range = ranges
+    if late or replaced:
+        _fill_in(kinematic, shown, things, late, replaced)
+    if kinematic.order == "shuffled":
+        kinematic.env.np_random.shuffle(shown[1:])
+    return shown.astype(np.float32)
+
+
+def _fill_in(
+    kinematic: KinematicObservation,
+    shown: NDArray[np.float64],
+    things: list[Vehicle],
+    late: frozenset[str],
+    replaced: Mapping[str, float],
+) -> None:
+    """Write the features that the kernel does not know into the rows of vehicles, and those that replace others."""
+    features, ranges = kinematic.features, kinematic.features_range if kinematic.normalize else {}
     values = {(0, name): value for name, value in replaced.items() if name in features}
-    for row, thing in enumerate((vehicle, *close) if late else ()):
+    for row, thing in enumerate(things if late else ()):
         found = _late_values(thing, with_destination=row == 0 or kinematic.observe_intentions)
         values |= {(row, name): found[name] for name in late}
     for (row, name), value in values.items():
         scaled = value
         if name in ranges:
             scaled = utils.lmap(np.float64(value), [ranges[name][0], ranges[name][1]], [-1, 1])
-            scaled = np.clip(scaled, -1, 1) if clip else scaled
+            scaled = np.clip(scaled, -1, 1) if kinematic.clip else scaled
         shown[row, features.index(name)] = scaled
-    if kinematic.order == "shuffled":
-        kinematic.env.np_random.shuffle(shown[1:])
-    return shown.astype(np.float32)
 
 
 def _late_values(thing: Vehicle, *, with_destination: bool) -> dict[str, float]:
@@ -158,23 +171,35 @@ def _scales_of(features: list[str], ranges: object) -> array[float] | None:
     return scales
 
 
-def observe_goal(
-    kinematic: KinematicsGoalObservation, state: RoadState | None
-) -> dict[str, NDArray[np.float64]] | None:
-    """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run."""
+def observe_goal(kinematic: KinematicsGoalObservation) -> dict[str, NDArray[np.float64]] | None:
+    """Return the result of `KinematicsGoalObservation.observe`; None if highway-env's own code must run.
+
+    A step observes three times, so only the vehicle and its goal are read, and not the road.
+    """
     vehicle, features = kinematic.observer_vehicle, kinematic.features
     goal = getattr(vehicle, "goal", None)
-    if state is None or not state.roster.describes or goal is None:
+    if vehicle is None or goal is None or type(features) is not list or not _CODES.keys() >= set(features):
         return None
-    if type(features) is not list or not _CODES.keys() >= set(features):
+    things = [vehicle, goal]
+    kinds = kinds_of(things)
+    if not are_plain(things, kinds) or not all(
+        kind.describes and kind.is_of(thing) and are_numbers((thing.heading, thing.speed))
+        # `to_dict` would compute the destination of a route, which may fail. It has no heading of a goal.
+        and not getattr(thing, "route", None) and (isinstance(thing, Vehicle) or "heading" not in features)
+        for thing, kind in zip(things, kinds, strict=True)
+    ):  # fmt: skip
         return None
-    shown = np.zeros((2, len(features)))
-    scales = _scales_of(features, {})
-    codes = bytes(map(_CODES.__getitem__, features))
-    if scales is None or not state.traffic.describe(shown, None, [vehicle, goal], codes, scales, False):
-        return None
-    (here, there), by = shown, kinematic.scales
-    return OrderedDict(observation=here / by, achieved_goal=here / by, desired_goal=there / by)
+    here, there = (np.array([values[name] for name in features]) for values in map(_vehicle_values, things))
+    scales = kinematic.scales
+    return OrderedDict(observation=here / scales, achieved_goal=here / scales, desired_goal=there / scales)
+
+
+def _vehicle_values(thing: RoadObject) -> dict[str, float]:
+    """Return those values of highway-env's `to_dict` that the kernel knows."""
+    (x, y), heading = thing.position.tolist(), float(thing.heading)
+    c, s = float(np.cos(thing.heading)), float(np.sin(thing.heading))
+    vx, vy = (float(thing.speed) * c, float(thing.speed) * s) if isinstance(thing, Vehicle) else (0.0, 0.0)
+    return {"presence": 1.0, "x": x, "y": y, "vx": vx, "vy": vy, "heading": heading, "cos_h": c, "sin_h": s}
 
 
 def observe_grid(grid: OccupancyGridObservation, state: RoadState | None) -> NDArray[np.generic] | None:
@@ -198,11 +223,11 @@ def observe_grid(grid: OccupancyGridObservation, state: RoadState | None) -> NDA
     scales = _scales_of(names, ranges)
     if scales is None or not _UNCOMPILED_FEATURES.isdisjoint(ranges):
         return None
-    table = np.zeros((len(vehicles), len(names)))
+    table = np.zeros((1 + len(vehicles), len(names)))
     codes = bytes(map(_CODES.__getitem__, names))
-    if not state.traffic.describe(table, observer, vehicles, codes, scales, False):
+    if not state.traffic.describe(table, [observer, *vehicles], 1, codes, scales, False):
         return None
-    columns = dict(zip(names, table.T, strict=True))
+    columns = dict(zip(names, table[1:].T, strict=True))
     places = [
         utils.lmap(columns[name], [-1, 1], [ranges[name][0], ranges[name][1]]) if name in ranges else columns[name]
         for name in ("x", "y")
@@ -307,7 +332,7 @@ def _as_tuple(value: object) -> object:
 
 def _are_known(features: object) -> bool:
     """Return whether there are features, all known and unique; a data frame repeats the column of an equal feature."""
-    if type(features) is not list or not features or not _UNCOMPILED_FEATURES.union(_CODES).issuperset(features):
+    if type(features) is not list or not features or not _KNOWN_FEATURES.issuperset(features):
         return False
     return len(set(features)) == len(features)
 

@@ -84,7 +84,9 @@ class Watch:
         """Return whether no member has changed; each changed member is logged once."""
         if self._contents is not None and self._contents.is_same():
             return True
-        contents = contents_of([place.owner for place in self._places])  # another thread may change them from here on
+        contents = contents_of(
+            [place.container for place in self._places]
+        )  # another thread may change them from here on
         suspects = [self._changed] if self._changed is not None and self._changed.changed() else self._places
         self._changed = next((place for place in suspects if place.changed()), None)
         if self._changed is None:
@@ -107,7 +109,6 @@ class _Place:
 
     def __init__(self, name: str, owner: Space, but: frozenset[str], names: tuple[str, ...] | None = None) -> None:
         self.name = name
-        self.owner = owner
         self.space: Mapping[str, object] = vars(owner) if isinstance(owner, type) else owner
         space = self.space
         if names is None:
@@ -118,8 +119,10 @@ class _Place:
             )
             self._seen = frozenset(space)
             self._but = frozenset(key for key in space if f"{name}.{key}" in but)
+            self.container: object = owner
         else:  # of a large foreign namespace such as NumPy's, watch only these names
             self._seen = self._but = frozenset(space)
+            self.container = (space, *names)
         #: the watched members
         self.members = {key: space[key] for key in names}
 

@@ -11,7 +11,8 @@
 //
 // Its parts are kernel_numbers.hpp (arithmetic), kernel_lanes.hpp, kernel_actors.hpp (state), kernel_neighbours.hpp,
 // kernel_policies.hpp (decisions), kernel_movement.hpp, kernel_collisions.hpp, kernel_predictions.hpp,
-// kernel_observations.hpp, and kernel_snapshots.hpp (what must stay the same). This file has what Python calls.
+// kernel_observations.hpp, and kernel_snapshots.hpp (what must stay the same). This file has what Python calls, by way
+// of python.hpp, the only header of another folder.
 
 #include "kernel_observations.hpp"
 #include "kernel_snapshots.hpp"
@@ -20,213 +21,151 @@ namespace {
 
 // ---------------------------------------------------------------------------------------------------------------- Traffic
 
+template <> struct From<Network *> {
+    static Network *of(PyObject *given) {
+        return Py_TYPE(given) == network_type ? reinterpret_cast<NetworkObject *>(given)->network
+                                              : (raise(PyExc_TypeError, "this is no network of the kernel"), nullptr);
+    }
+};
+struct TrafficObject {
+    PyObject_HEAD Traffic *traffic;
+};
+template <> Traffic &self_of<Traffic>(PyObject *object) { return *reinterpret_cast<TrafficObject *>(object)->traffic; }
+template <> Network &self_of<Network>(PyObject *object) { return *reinterpret_cast<NetworkObject *>(object)->network; }
+typedef Exact<&PyFloat_Type> Float;
+
 // After an error of highway-env: writes what is known, so that the caller sees the state at the moment of the error.
-PyObject *fail(Traffic *self, bool moved) {
+[[noreturn]] void fail(Traffic &self, bool moved) {
     PyObject *kind, *value, *trace;
     PyErr_Fetch(&kind, &value, &trace);
-    if (!publish_all(self, moved)) {
+    if (!publish_all(&self, moved)) {
         PyErr_Clear();
     }
     PyErr_Restore(kind, value, trace);
-    return nullptr;
+    throw Raised();
 }
 
-PyObject *traffic_read(Traffic *self, PyObject *) { return PyBool_FromLong(read_all(self)); }
-
-// is_current(road): whether the road has the same vehicles and objects, and everything about them that must stay the same.
-PyObject *traffic_is_current(Traffic *self, PyObject *road) {
-    const int found = is_current(self, road);
-    return found < 0 ? nullptr : PyBool_FromLong(found);
+void publish(Traffic &self, bool moved) {
+    if (!publish_all(&self, moved)) {
+        throw Raised();
+    }
 }
 
-PyObject *traffic_act(Traffic *self, PyObject *) {
-    if (!act_all(self)) {
-        return fail(self, false);
+bool traffic_read(Traffic &self) { return read_all(&self); }
+
+void traffic_act(Traffic &self) {
+    if (!act_all(&self)) {
+        fail(self, false);
     }
-    if (!publish_all(self, false)) {
-        return nullptr;
-    }
-    Py_RETURN_NONE;
+    publish(self, false);
 }
 
-PyObject *traffic_step(Traffic *self, PyObject *dt) {
-    if (!PyFloat_CheckExact(dt)) {
-        return PyErr_Format(PyExc_TypeError, "the length of a sub-step must be a float");
+bool traffic_step(Traffic &self, Float dt) {
+    const double length = PyFloat_AS_DOUBLE(dt.object);
+    const Moved moved = move_all(&self, length, dt);
+    if (moved == FAILED || (moved == FINITE && !collide_all(&self, length, dt))) {
+        fail(self, true);
     }
-    double length = PyFloat_AS_DOUBLE(dt);
-    Moved moved = move_all(self, length, dt);
-    if (moved == FAILED || (moved == FINITE && !collide_all(self, length, dt))) {
-        return fail(self, true);
-    }
-    return publish_all(self, true) ? PyBool_FromLong(moved == FINITE) : nullptr;
+    publish(self, true);
+    return moved == FINITE;
 }
 
-PyObject *traffic_collide(Traffic *self, PyObject *dt) {
-    if (!PyFloat_CheckExact(dt)) {
-        return PyErr_Format(PyExc_TypeError, "the length of a sub-step must be a float");
+void traffic_collide(Traffic &self, Float dt) {
+    if (!collide_all(&self, PyFloat_AS_DOUBLE(dt.object), dt)) {
+        fail(self, false);
     }
-    if (!collide_all(self, PyFloat_AS_DOUBLE(dt), dt)) {
-        return fail(self, false);
-    }
-    if (!publish_all(self, false)) {
-        return nullptr;
-    }
-    Py_RETURN_NONE;
+    publish(self, false);
 }
 
-std::ptrdiff_t count_crashed(const Traffic *self) {
-    return std::count_if(self->actors->begin(), self->actors->end(), [](const Actor &actor) { return actor.moves && actor.crashed; });
+std::ptrdiff_t count_crashed(const Traffic &self) {
+    return std::count_if(self.actors.begin(), self.actors.end(), [](const Actor &actor) { return actor.moves && actor.crashed; });
 }
 
 // run(count, dt, stops): several sub-steps; where it stops at crashes, the sub-step in which a vehicle crashes is the last.
-PyObject *traffic_run(Traffic *self, PyObject *args) {
-    int count, stops;
-    PyObject *dt;
-    if (!PyArg_ParseTuple(args, "iO!p", &count, &PyFloat_Type, &dt, &stops)) {
-        return nullptr;
-    }
-    double length = PyFloat_AS_DOUBLE(dt);
+std::tuple<int, bool> traffic_run(Traffic &self, int count, Float dt, bool stops) {
+    const double length = PyFloat_AS_DOUBLE(dt.object);
     Moved moved = FINITE;
     const std::ptrdiff_t crashed = count_crashed(self);
-    int &done = self->completed;
+    int &done = self.completed;
     for (done = 0; done < count && !(stops && count_crashed(self) > crashed); done++) {
-        if (!act_all(self)) {
-            return fail(self, done > 0);
+        if (!act_all(&self)) {
+            fail(self, done > 0);
         }
-        moved = move_all(self, length, dt);
+        moved = move_all(&self, length, dt);
         if (moved == NOT_FINITE) { // highway-env does the rest of a sub-step with numbers that are not finite
             break;
         }
-        if (moved == FAILED || !collide_all(self, length, dt)) {
-            return fail(self, true);
+        if (moved == FAILED || !collide_all(&self, length, dt)) {
+            fail(self, true);
         }
     }
-    return publish_all(self, true) ? Py_BuildValue("iO", done, moved == FINITE ? Py_False : Py_True) : nullptr;
+    publish(self, true);
+    return {done, moved != FINITE};
 }
-
-void traffic_dealloc(Traffic *self) {
-    if (self->actors) {
-        for (Actor &actor : *self->actors) {
-            if (actor.is_open) {
-                PyBuffer_Release(&actor.position);
-            }
-            Py_XDECREF(actor.object);
-        }
-    }
-    if (self->watched) {
-        for (Watched &watched : *self->watched) {
-            Py_XDECREF(reinterpret_cast<PyObject *>(watched.type));
-            Py_XDECREF(watched.fixed);
-            for (PyObject *key : watched.keys) {
-                Py_DECREF(key);
-            }
-        }
-    }
-    if (self->examples) {
-        for (Example &example : *self->examples) {
-            Py_XDECREF(example.object);
-            Py_XDECREF(example.names);
-            Py_XDECREF(example.values);
-        }
-    }
-    Py_XDECREF(self->road);
-    delete self->watched;
-    delete self->examples;
-    delete self->actors;
-    delete self->along;
-    delete self->across;
-    delete self->stamps;
-    delete self->queues;
-    Py_XDECREF(reinterpret_cast<PyObject *>(self->network));
-    PyTypeObject *type = Py_TYPE(self);
-    type->tp_free(reinterpret_cast<PyObject *>(self));
-    Py_DECREF(type);
-}
-
-PyTypeObject *network_type = nullptr;
 
 // Traffic(network, actors, models, flags, parameters, road, fixed, examples): `fixed` has a frozenset for each actor, and
 // `examples` pairs of an actor and the names of attributes.
-PyObject *traffic_new(PyTypeObject *type, PyObject *args, PyObject *) {
-    PyObject *network, *actors, *road, *fixed, *examples;
-    Py_buffer models, flags, parameters;
-    if (!PyArg_ParseTuple(args, "O!O!y*y*y*OO!O!", network_type, &network, &PyList_Type, &actors, &models, &flags,
-                          &parameters, &road, &PyList_Type, &fixed, &PyList_Type, &examples)) {
-        return nullptr;
+std::unique_ptr<Traffic> make_traffic(PyObject *network, std::vector<PyObject *> actors, PyObject *models, PyObject *flags,
+                                      PyObject *parameters, PyObject *road, std::vector<PyObject *> fixed,
+                                      std::vector<std::tuple<PyObject *, Tuple>> examples) {
+    const size_t count = actors.size();
+    const Buffer model(models, PyBUF_SIMPLE), flag(flags, PyBUF_SIMPLE), numbers(parameters, PyBUF_SIMPLE);
+    if (fixed.size() != count || model.size() != count || flag.size() != count ||
+        numbers.size() != count * sizeof(Parameters)) {
+        raise(PyExc_ValueError, "one model, flag and row of parameters is needed for each actor");
     }
-    size_t count = static_cast<size_t>(PyList_GET_SIZE(actors));
-    Traffic *self = nullptr;
-    if (static_cast<size_t>(PyList_GET_SIZE(fixed)) != count || static_cast<size_t>(models.len) != count || static_cast<size_t>(flags.len) != count ||
-        static_cast<size_t>(parameters.len) != count * sizeof(Parameters)) {
-        PyErr_SetString(PyExc_ValueError, "one model, flag and row of parameters is needed for each actor");
-    } else {
-        self = reinterpret_cast<Traffic *>(type->tp_alloc(type, 0));
+    auto made = std::make_unique<Traffic>();
+    made->network = From<Network *>::of(network);
+    made->network_object = Ref(Py_NewRef(network));
+    made->lanes = made->network->lanes.size();
+    made->along.resize(count * made->lanes);
+    made->across.resize(count * made->lanes);
+    made->stamps.resize(count * made->lanes);
+    made->queues.resize(made->lanes);
+    made->road = Ref(Py_NewRef(road));
+    for (size_t row = 0; row < count; row++) {
+        Actor &actor = made->actors.emplace_back();
+        actor.object = Py_NewRef(actors[row]);
+        actor.model = model.bytes()[row];
+        actor.moves = actor.model != OBJECT;
+        actor.has_target = actor.model == CONTROLLED || actor.model == IDM || actor.model == LINEAR;
+        actor.is_landmark = flag.bytes()[row] & 1; // see `_kernel_objects._flags_of`
+        actor.slides = flag.bytes()[row] & 2;
+        actor.changes_lanes = flag.bytes()[row] & 4;
+        actor.is_obstacle = flag.bytes()[row] & 8;
+        std::memcpy(&actor.parameters, numbers.bytes() + row * sizeof(Parameters), sizeof(Parameters));
+        actor.gap_root = 2 * std::sqrt(-actor.parameters.comfort_acc_max * actor.parameters.comfort_acc_min);
+        made->vehicles += actor.moves;
+        made->watched.push_back({Ref(Py_NewRef(reinterpret_cast<PyObject *>(Py_TYPE(actors[row])))),
+                                 Ref(Py_NewRef(fixed[row])), keys_of(actors[row])});
     }
-    if (self) {
-        Py_INCREF(network);
-        self->network = reinterpret_cast<Network *>(network);
-        self->lanes = self->network->lanes->size();
-        self->now = 0;
-        self->completed = 0;
-        self->actors = new std::vector<Actor>(count);
-        self->along = new std::vector<double>(count * self->lanes);
-        self->across = new std::vector<double>(count * self->lanes);
-        self->stamps = new std::vector<uint64_t>(count * self->lanes, 0);
-        self->queues = new std::vector<Queue>(self->lanes);
-        self->vehicles = 0;
-        for (size_t row = 0; row < count; row++) {
-            Actor &actor = (*self->actors)[row];
-            actor = Actor();
-            actor.object = PyList_GET_ITEM(actors, static_cast<Py_ssize_t>(row));
-            Py_INCREF(actor.object);
-            const int flag = static_cast<const char *>(flags.buf)[row]; // see `_kernel_objects._flags_of`
-            actor.model = static_cast<const char *>(models.buf)[row];
-            actor.moves = actor.model != OBJECT;
-            actor.has_target = actor.model == CONTROLLED || actor.model == IDM || actor.model == LINEAR;
-            actor.is_landmark = flag & 1;
-            actor.slides = flag & 2;
-            actor.changes_lanes = flag & 4;
-            actor.is_obstacle = flag & 8;
-            const char *numbers = static_cast<const char *>(parameters.buf) + row * sizeof(Parameters);
-            std::memcpy(&actor.parameters, numbers, sizeof(Parameters));
-            actor.gap_root = 2 * std::sqrt(-actor.parameters.comfort_acc_max * actor.parameters.comfort_acc_min);
-            self->vehicles += actor.moves;
+    for (const auto &[object, names] : examples) {
+        Ref values = values_of(object, names);
+        if (!values) {
+            throw Raised();
         }
-        self->road = Py_NewRef(road);
-        self->watched = new std::vector<Watched>();
-        self->examples = new std::vector<Example>();
-        if (!watch_all(self, fixed, examples)) {
-            Py_CLEAR(self);
-        }
+        made->examples.push_back({Ref(Py_NewRef(object)), Ref(Py_NewRef(names.object)), std::move(values)});
     }
-    PyBuffer_Release(&models);
-    PyBuffer_Release(&flags);
-    PyBuffer_Release(&parameters);
-    return reinterpret_cast<PyObject *>(self);
+    return made;
 }
 
 // conflicts(): the pairs of vehicles whose predicted outlines touch, each with whether that is certain; None if
 // highway-env must decide.
-PyObject *traffic_conflicts(Traffic *self, PyObject *) {
-    const std::vector<Path> paths = predict_all(self);
+std::optional<std::vector<std::tuple<size_t, size_t, bool>>> traffic_conflicts(Traffic &self) {
+    const std::vector<Path> paths = predict_all(&self);
     if (PyErr_Occurred()) {
-        return nullptr;
+        throw Raised();
     }
-    if (paths.size() < self->vehicles) {
-        Py_RETURN_NONE;
+    if (paths.size() < self.vehicles) {
+        return {};
     }
-    PyObject *found = PyList_New(0);
-    for (size_t row = 0; found && row < paths.size(); row++) {
-        for (size_t other = row + 1; found && other < paths.size(); other++) {
-            const Answer answer = is_conflict_possible((*self->actors)[row], paths[row], (*self->actors)[other], paths[other]);
-            if (answer == NO) {
-                continue;
+    std::vector<std::tuple<size_t, size_t, bool>> found;
+    for (size_t row = 0; row < paths.size(); row++) {
+        for (size_t other = row + 1; other < paths.size(); other++) {
+            const Answer answer = is_conflict_possible(self.actors[row], paths[row], self.actors[other], paths[other]);
+            if (answer != NO) {
+                found.emplace_back(row, other, answer == YES);
             }
-            PyObject *pair = Py_BuildValue("nnO", row, other, answer == YES ? Py_True : Py_False);
-            if (!pair || PyList_Append(found, pair)) {
-                Py_CLEAR(found);
-            }
-            Py_XDECREF(pair);
         }
     }
     return found;
@@ -234,221 +173,147 @@ PyObject *traffic_conflicts(Traffic *self, PyObject *) {
 
 // fill_times(grid, lanes, times, quantum, row, speeds, relations): fills the grid of a time-to-collision observation.
 // `relations` has a byte for each lane of the network.
-PyObject *traffic_fill_times(Traffic *self, PyObject *args) {
-    Py_buffer cells, speeds, relations;
-    TimeGrid grid;
-    Py_ssize_t row;
-    if (!PyArg_ParseTuple(args, "w*nndny*y*", &cells, &grid.lanes, &grid.times, &grid.quantum, &row, &speeds, &relations)) {
-        return nullptr;
+void traffic_fill_times(Traffic &self, PyObject *cells, Py_ssize_t lanes, Py_ssize_t times, double quantum, size_t row,
+                        PyObject *of_observer, PyObject *of_lanes) {
+    const Buffer buffer(cells, PyBUF_WRITABLE), speeds(of_observer, PyBUF_SIMPLE), relations(of_lanes, PyBUF_SIMPLE);
+    const TimeGrid grid = {reinterpret_cast<double *>(buffer.bytes()), lanes, times, quantum};
+    const Py_ssize_t count = speeds.view.len / static_cast<Py_ssize_t>(sizeof(double));
+    bool fits = lanes >= 0 && times >= 0 && row < self.vehicles && relations.size() == self.lanes && quantum > 0 &&
+                buffer.view.len == count * lanes * times * static_cast<Py_ssize_t>(sizeof(double));
+    for (size_t lane = 0; fits && lane < self.lanes; lane++) {
+        fits = relations.bytes()[lane] != SAME_LANES || self.network->lanes[lane].id < lanes;
     }
-    const Py_ssize_t count = speeds.len / static_cast<Py_ssize_t>(sizeof(double)), width = grid.lanes * grid.times;
-    bool fits = grid.lanes >= 0 && grid.times >= 0 && 0 <= row && row < static_cast<Py_ssize_t>(self->vehicles) &&
-                cells.len == count * width * static_cast<Py_ssize_t>(sizeof(double)) &&
-                relations.len == static_cast<Py_ssize_t>(self->lanes) && grid.quantum > 0;
-    const char *relation_of = static_cast<const char *>(relations.buf);
-    for (size_t lane = 0; fits && lane < self->lanes; lane++) {
-        fits = relation_of[lane] != SAME_LANES || (*self->network->lanes)[lane].id < grid.lanes;
+    if (!fits) {
+        raise(PyExc_ValueError, "the grid has another size than its parts");
     }
-    grid.cells = static_cast<double *>(cells.buf);
-    for (Py_ssize_t which = 0; fits && which < count; which++) {
+    for (Py_ssize_t which = 0; which < count; which++) {
         double speed;
-        std::memcpy(&speed, static_cast<const char *>(speeds.buf) + which * static_cast<Py_ssize_t>(sizeof(double)), sizeof(double));
-        for (size_t other = 0; other < self->vehicles; other++) {
-            const int lane = (*self->actors)[other].lane;
-            fill_times(self, grid, static_cast<size_t>(row), other, which, speed, relation_of[lane]);
+        std::memcpy(&speed, speeds.bytes() + which * static_cast<Py_ssize_t>(sizeof(double)), sizeof(double));
+        for (size_t other = 0; other < self.vehicles; other++) {
+            fill_times(&self, grid, row, other, which, speed, relations.bytes()[self.actors[other].lane]);
         }
     }
-    PyBuffer_Release(&cells);
-    PyBuffer_Release(&speeds);
-    PyBuffer_Release(&relations);
-    if (!fits) {
-        return PyErr_Format(PyExc_ValueError, "the grid has another size than its parts");
-    }
-    Py_RETURN_NONE;
 }
 
 // The row of a vehicle or object; NO_ROW if the road does not have it.
-size_t row_of(const Traffic *self, PyObject *object) {
-    const std::vector<Actor> &actors = *self->actors;
+size_t row_of(const Traffic &self, PyObject *object) {
+    const std::vector<Actor> &actors = self.actors;
     const auto which = std::find_if(actors.begin(), actors.end(), [object](const Actor &actor) { return actor.object == object; });
     return which == actors.end() ? NO_ROW : static_cast<size_t>(which - actors.begin());
 }
 
-PyObject *object_at(const Traffic *self, size_t row) { return row == NO_ROW ? Py_None : (*self->actors)[row].object; }
+Ref object_at(const Traffic &self, size_t row) {
+    return Ref(Py_NewRef(row == NO_ROW ? Py_None : self.actors[row].object));
+}
 
 // neighbour_vehicles(vehicle, lane): the objects ahead and behind; None if the road does not have the vehicle.
-PyObject *traffic_neighbour_vehicles(Traffic *self, PyObject *args) {
-    PyObject *vehicle;
-    int lane;
-    if (!PyArg_ParseTuple(args, "Oi", &vehicle, &lane)) {
-        return nullptr;
-    }
+std::optional<std::tuple<Ref, Ref>> traffic_neighbour_vehicles(Traffic &self, PyObject *vehicle, size_t lane) {
     const size_t row = row_of(self, vehicle);
-    if (lane < 0 || static_cast<size_t>(lane) >= self->lanes) {
-        return PyErr_Format(PyExc_IndexError, "no such lane");
+    if (lane >= self.lanes) {
+        raise(PyExc_IndexError, "no such lane");
     }
     if (row == NO_ROW) {
-        Py_RETURN_NONE;
+        return {};
     }
     size_t front, rear;
-    neighbour_vehicles(self, row, lane, front, rear);
-    return PyTuple_Pack(2, object_at(self, front), object_at(self, rear));
+    neighbour_vehicles(&self, row, static_cast<int>(lane), front, rear);
+    return std::tuple(object_at(self, front), object_at(self, rear));
 }
 
 // close_objects_to(vehicle, distance, sees_behind, is_sorted, only_vehicles): a list; None if the road does not have the
 // vehicle.
-PyObject *traffic_close_objects_to(Traffic *self, PyObject *args) {
-    PyObject *vehicle;
-    double distance;
-    int sees_behind, is_sorted, only_vehicles;
-    if (!PyArg_ParseTuple(args, "Odppp", &vehicle, &distance, &sees_behind, &is_sorted, &only_vehicles)) {
-        return nullptr;
+std::optional<std::vector<Ref>> traffic_close_objects_to(Traffic &self, PyObject *vehicle, double distance,
+                                                         bool sees_behind, bool is_sorted, bool only_vehicles) {
+    const size_t row = row_of(self, vehicle), count = only_vehicles ? self.vehicles : self.actors.size();
+    if (row >= self.vehicles) {
+        return {};
     }
-    const size_t row = row_of(self, vehicle), count = only_vehicles ? self->vehicles : self->actors->size();
-    if (row >= self->vehicles) {
-        Py_RETURN_NONE;
-    }
-    PyObject *found = PyList_New(0);
-    for (size_t other : close_objects_to(self, row, distance, sees_behind, is_sorted, count)) {
-        if (found && PyList_Append(found, object_at(self, other))) {
-            Py_CLEAR(found);
-        }
+    std::vector<Ref> found;
+    for (size_t other : close_objects_to(&self, row, distance, sees_behind, is_sorted, count)) {
+        found.push_back(object_at(self, other));
     }
     return found;
 }
 
-// describe(cells, observer, objects, features, scales, clips): writes a row for each object into the cells, from the
-// point of view of the observer, unless it is None; returns whether highway-env would describe all of them without an
-// error. A feature is a byte, and its scale two floats: the lower end, and the length of the interval, which is 0 for no
-// scale.
-PyObject *traffic_describe(Traffic *self, PyObject *args) {
-    Py_buffer cells, features, numbers;
-    PyObject *observer, *objects;
-    int clips;
-    if (!PyArg_ParseTuple(args, "w*OO!y*y*p", &cells, &observer, &PyList_Type, &objects, &features, &numbers, &clips)) {
-        return nullptr;
-    }
-    const size_t columns = static_cast<size_t>(features.len), lines = static_cast<size_t>(PyList_GET_SIZE(objects));
-    const char *codes = static_cast<const char *>(features.buf);
+// describe(cells, objects, absolute, features, scales, clips): writes a row for each object into the cells, from the point
+// of view of the first object but for a number of absolute rows; returns whether highway-env would describe all of them
+// without an error. A feature is a byte, and its scale two floats: the lower end, and the length of the interval, which is
+// 0 for no scale.
+bool traffic_describe(Traffic &self, PyObject *table, std::vector<PyObject *> objects, size_t absolute, PyObject *features,
+                      PyObject *numbers, bool clips) {
+    const Buffer cells(table, PyBUF_WRITABLE), codes(features, PyBUF_SIMPLE), given(numbers, PyBUF_SIMPLE);
+    const size_t columns = codes.size();
     std::vector<Scale> scales(columns);
-    bool fits = static_cast<size_t>(numbers.len) == 2 * columns * sizeof(double) &&
-                static_cast<size_t>(cells.len) >= lines * columns * sizeof(double);
+    bool fits = given.size() == 2 * columns * sizeof(double) &&
+                cells.size() >= objects.size() * columns * sizeof(double);
     for (size_t column = 0; fits && column < columns; column++) {
-        double given[2];
-        std::memcpy(given, static_cast<const char *>(numbers.buf) + column * sizeof(given), sizeof(given));
-        scales[column] = {given[0], given[1], given[1] != 0};
-        fits = codes[column] >= 0 && codes[column] < FEATURES;
+        double scale[2];
+        std::memcpy(scale, given.bytes() + column * sizeof(scale), sizeof(scale));
+        scales[column] = {scale[0], scale[1], scale[1] != 0};
+        fits = codes.bytes()[column] >= 0 && codes.bytes()[column] < FEATURES;
     }
-    const size_t from = row_of(self, observer);
-    bool all = observer == Py_None || from != NO_ROW;
-    for (size_t line = 0; fits && all && line < lines; line++) {
-        const size_t row = row_of(self, PyList_GET_ITEM(objects, static_cast<Py_ssize_t>(line)));
-        all = row != NO_ROW && is_described(self->network, (*self->actors)[row], codes, columns);
-        if (all) {
-            describe((*self->actors)[row], from == NO_ROW ? nullptr : &(*self->actors)[from], codes, scales.data(), columns,
-                     clips, static_cast<double *>(cells.buf) + line * columns);
-        }
-    }
-    PyBuffer_Release(&cells);
-    PyBuffer_Release(&features);
-    PyBuffer_Release(&numbers);
     if (!fits) {
-        return PyErr_Format(PyExc_ValueError, "the cells have another size than their parts");
+        raise(PyExc_ValueError, "the cells have another size than their parts");
     }
-    return PyErr_Occurred() ? nullptr : PyBool_FromLong(all);
+    const Actor *observer = nullptr;
+    double *out = reinterpret_cast<double *>(cells.bytes());
+    for (size_t line = 0; line < objects.size(); line++, out += columns) {
+        const size_t row = row_of(self, objects[line]);
+        if (row == NO_ROW || !is_described(self.network, self.actors[row], codes.bytes(), columns)) {
+            return false;
+        }
+        const Actor &actor = self.actors[row];
+        observer = line ? observer : &actor;
+        describe(actor, line < absolute ? nullptr : observer, codes.bytes(), scales.data(), columns, clips, out);
+    }
+    return true;
 }
 
-PyObject *traffic_completed(Traffic *self, PyObject *) { return PyLong_FromLong(self->completed); }
+int traffic_completed(Traffic &self) { return self.completed; }
 
 PyMethodDef traffic_methods[] = {
-    {"read", reinterpret_cast<PyCFunction>(traffic_read), METH_NOARGS, nullptr},
-    {"is_current", reinterpret_cast<PyCFunction>(traffic_is_current), METH_O, nullptr},
-    {"act", reinterpret_cast<PyCFunction>(traffic_act), METH_NOARGS, nullptr},
-    {"step", reinterpret_cast<PyCFunction>(traffic_step), METH_O, nullptr},
-    {"collide", reinterpret_cast<PyCFunction>(traffic_collide), METH_O, nullptr},
-    {"completed", reinterpret_cast<PyCFunction>(traffic_completed), METH_NOARGS, nullptr},
-    {"run", reinterpret_cast<PyCFunction>(traffic_run), METH_VARARGS, nullptr},
-    {"conflicts", reinterpret_cast<PyCFunction>(traffic_conflicts), METH_NOARGS, nullptr},
-    {"neighbour_vehicles", reinterpret_cast<PyCFunction>(traffic_neighbour_vehicles), METH_VARARGS, nullptr},
-    {"close_objects_to", reinterpret_cast<PyCFunction>(traffic_close_objects_to), METH_VARARGS, nullptr},
-    {"describe", reinterpret_cast<PyCFunction>(traffic_describe), METH_VARARGS, nullptr},
-    {"fill_times", reinterpret_cast<PyCFunction>(traffic_fill_times), METH_VARARGS, nullptr},
+    {"read", METHOD(traffic_read), nullptr},
+    {"is_current", METHOD(traffic_is_current), nullptr},
+    {"act", METHOD(traffic_act), nullptr},
+    {"step", METHOD(traffic_step), nullptr},
+    {"collide", METHOD(traffic_collide), nullptr},
+    {"completed", METHOD(traffic_completed), nullptr},
+    {"run", METHOD(traffic_run), nullptr},
+    {"conflicts", METHOD(traffic_conflicts), nullptr},
+    {"neighbour_vehicles", METHOD(traffic_neighbour_vehicles), nullptr},
+    {"close_objects_to", METHOD(traffic_close_objects_to), nullptr},
+    {"describe", METHOD(traffic_describe), nullptr},
+    {"fill_times", METHOD(traffic_fill_times), nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 
-PyType_Slot traffic_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(traffic_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(traffic_dealloc)},
-    {Py_tp_methods, traffic_methods},
-    {Py_tp_doc, const_cast<char *>("The vehicles and objects of a road.")},
-    {0, nullptr},
-};
-PyType_Spec traffic_spec = {"_crashhunt_highway.Traffic", sizeof(Traffic), 0, Py_TPFLAGS_DEFAULT, traffic_slots};
-
 // ---------------------------------------------------------------------------------------------------------------- Network
 
-void network_dealloc(Network *self) {
-    delete self->lanes;
-    delete self->connected;
-    Py_XDECREF(self->keys);
-    Py_XDECREF(self->objects);
-    Py_XDECREF(self->index);
-    PyTypeObject *type = Py_TYPE(self);
-    type->tp_free(reinterpret_cast<PyObject *>(self));
-    Py_DECREF(type);
-}
-
 // Network(keys, lanes, index, table, connected): the table has a `LaneRow` for each lane.
-PyObject *network_new(PyTypeObject *type, PyObject *args, PyObject *) {
-    PyObject *keys, *found, *index, *connected;
-    Py_buffer table;
-    if (!PyArg_ParseTuple(args, "O!O!O!y*O!", &PyList_Type, &keys, &PyList_Type, &found, &PyDict_Type, &index, &table,
-                          &PyList_Type, &connected)) {
-        return nullptr;
+std::unique_ptr<Network> make_network(List keys, List objects, Dict index, PyObject *table,
+                                      std::vector<std::vector<std::tuple<int, double>>> connected) {
+    const Buffer rows(table, PyBUF_SIMPLE);
+    const size_t count = static_cast<size_t>(PyList_GET_SIZE(keys.object));
+    if (rows.size() != count * sizeof(LaneRow) || static_cast<size_t>(PyList_GET_SIZE(objects.object)) != count) {
+        raise(PyExc_ValueError, "one row of the table is needed for each lane");
     }
-    const size_t count = static_cast<size_t>(PyList_GET_SIZE(keys));
-    Network *self = nullptr;
-    if (static_cast<size_t>(table.len) != count * sizeof(LaneRow) ||
-        static_cast<size_t>(PyList_GET_SIZE(found)) != count) {
-        PyErr_SetString(PyExc_ValueError, "one row of the table is needed for each lane");
-    } else {
-        self = reinterpret_cast<Network *>(type->tp_alloc(type, 0));
+    auto made = std::make_unique<Network>();
+    made->keys = Ref(Py_NewRef(keys.object));
+    made->objects = Ref(Py_NewRef(objects.object));
+    made->index = Ref(Py_NewRef(index.object));
+    for (size_t number = 0; number < count; number++) {
+        LaneRow row;
+        std::memcpy(&row, rows.bytes() + number * sizeof(LaneRow), sizeof(LaneRow));
+        PyObject *key = PyList_GET_ITEM(keys.object, static_cast<Py_ssize_t>(number));
+        made->lanes.emplace_back(row, std::get<2>(From<std::tuple<PyObject *, PyObject *, int>>::of(key)));
     }
-    if (self) {
-        self->lanes = new std::vector<Lane>();
-        self->connected = new std::vector<Connections>();
-        self->keys = keys;
-        self->objects = found;
-        self->index = index;
-        Py_INCREF(keys);
-        Py_INCREF(found);
-        Py_INCREF(index);
-        for (size_t number = 0; number < count && !PyErr_Occurred(); number++) {
-            LaneRow row;
-            std::memcpy(&row, static_cast<const char *>(table.buf) + number * sizeof(LaneRow), sizeof(LaneRow));
-            PyObject *key = PyList_GET_ITEM(keys, static_cast<Py_ssize_t>(number));
-            PyObject *last = PyTuple_GetItem(key, 2);
-            self->lanes->emplace_back(row, last ? static_cast<int>(PyLong_AsLong(last)) : 0);
-        }
-        for (Py_ssize_t number = 0; number < PyList_GET_SIZE(connected) && !PyErr_Occurred(); number++) {
-            Connections row;
-            PyObject *pairs = PyList_GET_ITEM(connected, number);
-            for (Py_ssize_t at = 0; at < PyList_Size(pairs); at++) {
-                int other;
-                double offset;
-                if (!PyArg_ParseTuple(PyList_GET_ITEM(pairs, at), "id", &other, &offset)) {
-                    break;
-                }
-                row.emplace_back(other, offset);
-            }
-            self->connected->push_back(row);
-        }
-        if (PyErr_Occurred()) {
-            Py_CLEAR(self);
+    for (const auto &pairs : connected) {
+        Connections &lanes = made->connected.emplace_back();
+        for (const auto &[other, offset] : pairs) {
+            lanes.emplace_back(other, offset);
         }
     }
-    PyBuffer_Release(&table);
-    return reinterpret_cast<PyObject *>(self);
+    return made;
 }
 
 // The grid of an occupancy grid observation, in m: its axes are those of the observer, or those of the world.
@@ -481,8 +346,10 @@ struct Grid {
     }
 };
 
-// Marks the cells of the points on one lane, and lists the points about which highway-env must decide. False: an error.
-bool mark_lane(const Lane &lane, Py_ssize_t number, const Grid &grid, char *marks, PyObject *unsure) {
+typedef std::vector<std::tuple<size_t, double>> Unsure; // the numbers of lanes, and places on them
+
+// Marks the cells of the points on one lane, and lists the points about which highway-env must decide.
+void mark_lane(const Lane &lane, size_t number, const Grid &grid, char *marks, Unsure &unsure) {
     double origin, lateral, last = NAN;
     lane.local_coordinates(grid.x, grid.y, origin, lateral);
     // The points are those of np.arange, which adds multiples of the first difference.
@@ -496,82 +363,64 @@ bool mark_lane(const Lane &lane, Py_ssize_t number, const Grid &grid, char *mark
         last = point;
         lane.position(point, px, py);
         if (!grid.mark(px, py, marks)) {
-            PyObject *pair = Py_BuildValue("nd", number, point);
-            bool listed = pair && PyList_Append(unsure, pair) == 0;
-            Py_XDECREF(pair);
-            if (!listed) {
-                return false;
-            }
+            unsure.emplace_back(number, point);
         }
     }
-    return true;
 }
 
 // mark_cells(...): a byte for each cell that is 1 if a point of a lane is in it, and a list of lanes with points about
 // which highway-env must decide.
-PyObject *network_mark_cells(Network *self, PyObject *args) {
+std::tuple<Ref, Unsure> network_mark_cells(Network &self, std::tuple<double, double> position,
+                                           std::tuple<double, double> direction, double reach, double spacing,
+                                           std::tuple<double, double> low, std::tuple<double, double> step,
+                                           std::tuple<Py_ssize_t, Py_ssize_t> cells, bool is_aligned) {
     Grid grid;
-    if (!PyArg_ParseTuple(args, "(dd)(dd)dd(dd)(dd)(nn)p", &grid.x, &grid.y, &grid.cosine, &grid.sine, &grid.reach,
-                          &grid.spacing, &grid.low[0], &grid.low[1], &grid.step[0], &grid.step[1], &grid.cells[0],
-                          &grid.cells[1], &grid.is_aligned)) {
-        return nullptr;
-    }
+    std::tie(grid.x, grid.y) = position;
+    std::tie(grid.cosine, grid.sine) = direction;
+    std::tie(grid.low[0], grid.low[1]) = low;
+    std::tie(grid.step[0], grid.step[1]) = step;
+    std::tie(grid.cells[0], grid.cells[1]) = cells;
+    grid.reach = reach;
+    grid.spacing = spacing;
+    grid.is_aligned = is_aligned;
     const Py_ssize_t most = 1000000;
     if (!(grid.spacing > 0 && grid.reach / grid.spacing < 1e6) || grid.cells[0] < 0 || grid.cells[1] < 0 ||
         grid.cells[0] > most || grid.cells[1] > most) {
-        return PyErr_Format(PyExc_ValueError, "the grid is too large");
+        raise(PyExc_ValueError, "the grid is too large");
     }
-    PyObject *marks = PyByteArray_FromStringAndSize(nullptr, grid.cells[0] * grid.cells[1]);
-    PyObject *unsure = PyList_New(0), *both = nullptr;
-    if (marks && unsure) {
-        char *first = PyByteArray_AS_STRING(marks);
-        std::memset(first, 0, static_cast<size_t>(PyByteArray_GET_SIZE(marks)));
-        bool done = true;
-        for (size_t number = 0; done && number < self->lanes->size(); number++) {
-            done = mark_lane((*self->lanes)[number], static_cast<Py_ssize_t>(number), grid, first, unsure);
-        }
-        both = done ? PyTuple_Pack(2, marks, unsure) : nullptr;
+    Ref marks(PyByteArray_FromStringAndSize(nullptr, grid.cells[0] * grid.cells[1]));
+    if (!marks) {
+        throw Raised();
     }
-    Py_XDECREF(marks);
-    Py_XDECREF(unsure);
-    return both;
+    char *first = PyByteArray_AS_STRING(marks.object);
+    std::memset(first, 0, static_cast<size_t>(PyByteArray_GET_SIZE(marks.object)));
+    Unsure unsure;
+    for (size_t number = 0; number < self.lanes.size(); number++) {
+        mark_lane(self.lanes[number], number, grid, first, unsure);
+    }
+    return {std::move(marks), std::move(unsure)};
 }
 
 PyMethodDef network_methods[] = {
-    {"mark_cells", reinterpret_cast<PyCFunction>(network_mark_cells), METH_VARARGS, nullptr},
+    {"mark_cells", METHOD(network_mark_cells), nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
-
-PyType_Slot network_slots[] = {
-    {Py_tp_new, reinterpret_cast<void *>(network_new)},
-    {Py_tp_dealloc, reinterpret_cast<void *>(network_dealloc)},
-    {Py_tp_methods, network_methods},
-    {Py_tp_doc, const_cast<char *>("The lanes of a road.")},
-    {0, nullptr},
-};
-PyType_Spec network_spec = {"_crashhunt_highway.Network", sizeof(Network), 0, Py_TPFLAGS_DEFAULT, network_slots};
 
 // ----------------------------------------------------------------------------------------------------------------- module
 
 // bind(float64, int64, float32, ndarray, zeros, slide, [sin, cos, ...], fused, product_fused, exponent_step): NumPy's types and functions, and
 // the function that moves a vehicle with the dynamic bicycle model.
-PyObject *bind(PyObject *, PyObject *args) {
-    PyObject *number, *whole, *short_number, *array, *zeros, *slide_function, *ufuncs;
-    int is_fused, is_product_fused;
-    Py_ssize_t step;
-    if (!PyArg_ParseTuple(args, "OOOOOOO!ppn", &number, &whole, &short_number, &array, &zeros, &slide_function,
-                          &PyList_Type, &ufuncs, &is_fused, &is_product_fused, &step)) {
-        return nullptr;
-    }
-    if (PyList_GET_SIZE(ufuncs) != FUNCTIONS) {
-        return PyErr_Format(PyExc_ValueError, "seven functions are needed");
+void bind(PyObject *number, PyObject *whole, PyObject *short_number, PyObject *array, PyObject *zeros,
+          PyObject *slide_function, std::vector<PyObject *> ufuncs, bool is_fused, bool is_product_fused, Py_ssize_t step) {
+    if (ufuncs.size() != FUNCTIONS) {
+        raise(PyExc_ValueError, "seven functions are needed");
     }
     for (int wanted = 0; wanted < FUNCTIONS; wanted++) {
-        const UFunc *ufunc = reinterpret_cast<const UFunc *>(PyList_GET_ITEM(ufuncs, wanted));
+        const UFunc *ufunc = reinterpret_cast<const UFunc *>(ufuncs[static_cast<size_t>(wanted)]);
         int arguments = wanted == ARCTAN2 || wanted == POWER ? 2 : 1, which = 0;
         if (ufunc->nin != arguments || ufunc->nout != 1 || ufunc->nargs != arguments + 1 || !ufunc->name ||
             std::strcmp(ufunc->name, NAMES[wanted])) {
-            return PyErr_Format(PyExc_OSError, "NumPy's function %s has an unknown layout", NAMES[wanted]);
+            raise(PyExc_OSError, "NumPy's function %s has an unknown layout", NAMES[wanted]);
         }
         for (; which < ufunc->ntypes; which++) {
             const char *types = ufunc->types + which * ufunc->nargs;
@@ -584,7 +433,7 @@ PyObject *bind(PyObject *, PyObject *args) {
             }
         }
         if (which == ufunc->ntypes || !ufunc->functions[which]) {
-            return PyErr_Format(PyExc_OSError, "NumPy's function %s is not for float64", NAMES[wanted]);
+            raise(PyExc_OSError, "NumPy's function %s is not for float64", NAMES[wanted]);
         }
         functions[wanted] = {ufunc->functions[which], ufunc->data ? ufunc->data[which] : nullptr};
     }
@@ -597,106 +446,72 @@ PyObject *bind(PyObject *, PyObject *args) {
     fused = is_fused;
     product_fused = is_product_fused;
     exponent_step = step;
-    Py_RETURN_NONE;
 }
 
 // compute(name, *numbers): the result of one function, for the comparison with NumPy.
-PyObject *compute(PyObject *, PyObject *args) {
-    const char *name;
-    double a, b = 0, c = 0, d = 0, e = 0, f = 0;
-    if (!PyArg_ParseTuple(args, "sd|ddddd", &name, &a, &b, &c, &d, &e, &f)) {
-        return nullptr;
-    }
+double compute(std::string name, std::vector<double> numbers) {
+    numbers.resize(6);
+    const double a = numbers[0], b = numbers[1], c = numbers[2], d = numbers[3];
     for (int number = 0; number < FUNCTIONS; number++) {
-        if (!std::strcmp(name, NAMES[number])) {
-            return PyFloat_FromDouble(number == ARCTAN2 || number == POWER ? call(number, a, b) : call(number, a));
+        if (name == NAMES[number]) {
+            return number == ARCTAN2 || number == POWER ? call(number, a, b) : call(number, a);
         }
     }
-    if (!std::strcmp(name, "dot")) {
-        return PyFloat_FromDouble(dot(a, b, c, d));
+    const std::pair<const char *, double> others[] = {
+        {"dot", dot(a, b, c, d)}, {"product", product(a, b, c, d)}, {"turned", turned(a, b, c, d)},
+        {"dot3", dot(&numbers[0], &numbers[3])}, {"square", square(a)}, {"remainder", remainder_of(a, b)},
+    };
+    for (const auto &[known, found] : others) {
+        if (name == known) {
+            return found;
+        }
     }
-    if (!std::strcmp(name, "product")) {
-        return PyFloat_FromDouble(product(a, b, c, d));
-    }
-    if (!std::strcmp(name, "dot3")) {
-        const double one[3] = {a, b, c}, two[3] = {d, e, f};
-        return PyFloat_FromDouble(dot(one, two));
-    }
-    if (!std::strcmp(name, "turned")) {
-        return PyFloat_FromDouble(turned(a, b, c, d));
-    }
-    if (!std::strcmp(name, "square")) {
-        return PyFloat_FromDouble(square(a));
-    }
-    if (!std::strcmp(name, "remainder")) {
-        return PyFloat_FromDouble(remainder_of(a, b));
-    }
-    return PyErr_Format(PyExc_ValueError, "unknown function %s", name);
+    raise(PyExc_ValueError, "unknown function %s", name.c_str());
 }
 
 // mirrored_poses(objects, half_lengths): the points half a length ahead of objects, their headings and their speeds, with the
 // y axis up; None if one of them has an unusual type. The cosine and the sine are those of Python's `math`.
-PyObject *mirrored_poses(PyObject *, PyObject *args) {
-    PyObject *objects, *halves;
-    if (!PyArg_ParseTuple(args, "O!O!", &PyList_Type, &objects, &PyList_Type, &halves)) {
-        return nullptr;
+std::optional<std::tuple<std::vector<std::tuple<double, double>>, std::vector<double>, std::vector<double>>>
+mirrored_poses(std::vector<PyObject *> objects, std::vector<double> halves) {
+    if (halves.size() != objects.size()) {
+        raise(PyExc_ValueError, "one half of a length is needed for each object");
     }
-    const Py_ssize_t count = PyList_GET_SIZE(objects);
-    if (PyList_GET_SIZE(halves) != count) {
-        return PyErr_Format(PyExc_ValueError, "one half of a length is needed for each object");
-    }
-    PyObject *points = PyList_New(count), *headings = PyList_New(count), *speeds = PyList_New(count), *all = nullptr;
-    bool known = points && headings && speeds;
-    for (Py_ssize_t at = 0; known && at < count; at++) {
-        PyObject *object = PyList_GET_ITEM(objects, at), *position = attribute(object, s_position);
+    std::vector<std::tuple<double, double>> points;
+    std::vector<double> headings, speeds;
+    for (size_t at = 0; at < objects.size(); at++) {
+        const Ref position = attribute(objects[at], s_position);
         Number heading, speed;
         Py_buffer view;
-        known = position && open_floats(position, view, 2, 0);
-        if (known) {
-            const double *place = static_cast<const double *>(view.buf);
-            const double x = place[0], y = place[1], half = PyFloat_AsDouble(PyList_GET_ITEM(halves, at));
-            PyBuffer_Release(&view);
-            known = read_number(object, s_heading, heading) && read_number(object, s_speed, speed) &&
-                    std::isfinite(heading.value) && !PyErr_Occurred();
-            if (known) {
-                const double c = std::cos(heading.value), s = std::sin(heading.value);
-                PyList_SET_ITEM(points, at, Py_BuildValue("(dd)", x + half * c, 0.0 - (y + half * s)));
-                PyList_SET_ITEM(headings, at, PyFloat_FromDouble(0.0 - heading.value));
-                PyList_SET_ITEM(speeds, at, PyFloat_FromDouble(speed.value));
-                known = !PyErr_Occurred();
-            }
+        if (!position || !open_floats(position.object, view, 2, 0)) {
+            return {};
         }
-        Py_XDECREF(position);
+        const double x = static_cast<double *>(view.buf)[0], y = static_cast<double *>(view.buf)[1];
+        PyBuffer_Release(&view);
+        if (!read_number(objects[at], s_heading, heading) || !read_number(objects[at], s_speed, speed) ||
+            !std::isfinite(heading.value)) {
+            return {};
+        }
+        const double c = std::cos(heading.value), s = std::sin(heading.value);
+        points.emplace_back(x + halves[at] * c, 0.0 - (y + halves[at] * s));
+        headings.push_back(0.0 - heading.value);
+        speeds.push_back(speed.value);
     }
-    if (known) {
-        all = PyTuple_Pack(3, points, headings, speeds);
-    } else if (!PyErr_Occurred()) {
-        all = Py_NewRef(Py_None);
-    }
-    Py_XDECREF(points);
-    Py_XDECREF(headings);
-    Py_XDECREF(speeds);
-    return all;
+    return std::tuple(std::move(points), std::move(headings), std::move(speeds));
 }
 
 // bind_turn(rounds): how NumPy multiplies a matrix by a vector.
-PyObject *bind_turn(PyObject *, PyObject *number) {
-    const long rounds = PyLong_AsLong(number);
+void bind_turn(int rounds) {
     if (rounds < UNKNOWN || rounds >= TURNS) {
-        if (!PyErr_Occurred()) {
-            PyErr_Format(PyExc_ValueError, "unknown way of rounding %ld", rounds);
-        }
-        return nullptr;
+        raise(PyExc_ValueError, "unknown way of rounding %d", rounds);
     }
-    turn_rounds = static_cast<int>(rounds);
-    Py_RETURN_NONE;
+    turn_rounds = rounds;
 }
 
 PyMethodDef methods[] = {
-    {"bind", bind, METH_VARARGS, nullptr},
-    {"bind_turn", bind_turn, METH_O, nullptr},
-    {"mirrored_poses", mirrored_poses, METH_VARARGS, nullptr},
-    {"compute", compute, METH_VARARGS, nullptr},
+    {"bind", FUNCTION(bind), nullptr},
+    {"bind_turn", FUNCTION(bind_turn), nullptr},
+    {"mirrored_poses", FUNCTION(mirrored_poses), nullptr},
+    {"compute", FUNCTION(compute), nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 
@@ -721,22 +536,20 @@ bool intern_names() {
 } // namespace
 
 PyMODINIT_FUNC PyInit__crashhunt_highway() {
-    PyObject *module = intern_names() ? PyModule_Create(&definition) : nullptr;
-    const struct {
-        const char *name;
-        PyType_Spec *spec;
-    } types[] = {{"Network", &network_spec}, {"Traffic", &traffic_spec}, {"Contents", &contents_spec}};
-    for (const auto &type : types) {
-        PyObject *made = module ? PyType_FromSpec(type.spec) : nullptr;
-        if (!made || PyModule_AddObjectRef(module, type.name, made)) {
-            Py_CLEAR(module);
-        } else if (type.spec == &network_spec) {
-            network_type = reinterpret_cast<PyTypeObject *>(Py_NewRef(made));
-        }
-        Py_XDECREF(made);
+    Ref module(intern_names() ? PyModule_Create(&definition) : nullptr);
+    if (!module || PyModule_AddIntConstant(module.object, "INTERFACE", CRASHHUNT_INTERFACE)) {
+        return nullptr;
     }
-    if (module && PyModule_AddIntConstant(module, "INTERFACE", CRASHHUNT_INTERFACE)) {
-        Py_CLEAR(module);
+    try {
+        network_type = add_class<NetworkObject, &NetworkObject::network, make_network>(
+            module.object, "_crashhunt_highway.Network", network_methods, no_getters, "The lanes of a road.");
+        add_class<TrafficObject, &TrafficObject::traffic, make_traffic>(
+            module.object, "_crashhunt_highway.Traffic", traffic_methods, no_getters, "The vehicles and objects of a road.");
+        add_class<ContentsObject, &ContentsObject::contents, make_contents>(
+            module.object, "_crashhunt_highway.Contents", contents_methods, no_getters,
+            "The contents of containers at one time.");
+    } catch (const Raised &) {
+        return nullptr;
     }
-    return module;
+    return module.give();
 }

@@ -99,30 +99,39 @@ struct Queue {
 
 // What must stay the same about an actor, apart from its state.
 struct Watched {
-    PyTypeObject *type;
-    PyObject *fixed;               // a frozenset: the names of attributes that the actor must not get
-    std::vector<PyObject *> keys;  // of its attributes, which are none of these, or had them at the beginning
+    Ref type;
+    Ref fixed;             // a frozenset: the names of attributes that the actor must not get
+    std::vector<Ref> keys; // of its attributes, which are none of these, or had them at the beginning
 };
 
 // Attributes that an actor shares with the others of its class, or its own ones that replace them.
 struct Example {
-    PyObject *object, *names, *values; // the latter are tuples
+    Ref object, names, values; // the latter are tuples
 };
 
 struct Traffic {
-    PyObject_HEAD
-    Network *network;
-    PyObject *road;
-    std::vector<Watched> *watched;     // by row
-    std::vector<Example> *examples;
-    std::vector<Actor> *actors;          // vehicles, then objects
-    std::vector<double> *along, *across; // coordinates of actors on lanes
-    std::vector<uint64_t> *stamps;       // the instant at which these are valid
-    std::vector<Queue> *queues;          // by lane
-    uint64_t now;
-    int completed; // sub-steps of the last `run`
-    size_t vehicles;
-    size_t lanes;
+    Ref network_object;
+    Network *network = nullptr;
+    Ref road;
+    std::vector<Watched> watched; // by row
+    std::vector<Example> examples;
+    std::vector<Actor> actors;          // vehicles, then objects
+    std::vector<double> along, across;  // coordinates of actors on lanes
+    std::vector<uint64_t> stamps;       // the instant at which these are valid
+    std::vector<Queue> queues;          // by lane
+    uint64_t now = 0;
+    int completed = 0; // sub-steps of the last `run`
+    size_t vehicles = 0;
+    size_t lanes = 0;
+
+    ~Traffic() {
+        for (Actor &actor : actors) {
+            if (actor.is_open) {
+                PyBuffer_Release(&actor.position);
+            }
+            Py_XDECREF(actor.object);
+        }
+    }
 };
 
 bool has_type(PyObject *value, PyObject *type) { return Py_TYPE(value) == reinterpret_cast<PyTypeObject *>(type); }
@@ -146,30 +155,27 @@ bool read_value(PyObject *value, Number &number) {
     return std::fabs(number.value) < 9007199254740992.0; // from 2**53 on, a float is not exact
 }
 
-// An attribute; a new reference, or null with no error set.
-PyObject *attribute(PyObject *object, PyObject *name) {
+// An attribute; null with no error set if it is missing.
+Ref attribute(PyObject *object, PyObject *name) {
     PyObject *found = PyObject_GetAttr(object, name);
     if (!found) {
         PyErr_Clear();
     }
-    return found;
+    return Ref(found);
 }
 
 bool read_number(PyObject *object, PyObject *name, Number &number) {
-    PyObject *found = attribute(object, name);
-    bool read = found && read_value(found, number);
-    Py_XDECREF(found);
-    return read;
+    const Ref found = attribute(object, name);
+    return found && read_value(found.object, number);
 }
 
 bool read_bool(PyObject *object, PyObject *name, bool &truth) {
-    PyObject *found = attribute(object, name);
-    bool read = found && PyBool_Check(found);
-    if (read) {
-        truth = found == Py_True;
+    const Ref found = attribute(object, name);
+    if (!found || !PyBool_Check(found.object)) {
+        return false;
     }
-    Py_XDECREF(found);
-    return read;
+    truth = found.object == Py_True;
+    return true;
 }
 
 // Opens an array of `count` floats; any other object makes the kernel refuse.
@@ -190,57 +196,48 @@ bool open_floats(PyObject *array, Py_buffer &view, Py_ssize_t count, int flags) 
 
 // Reads a list of numbers, or an array of floats.
 bool read_numbers(PyObject *object, PyObject *name, double *numbers, Py_ssize_t count) {
-    PyObject *found = attribute(object, name);
+    const Ref found = attribute(object, name);
     Py_buffer view;
-    bool read = found != nullptr;
-    if (read && PyList_CheckExact(found)) {
-        read = PyList_GET_SIZE(found) == count;
+    bool read = bool(found);
+    if (read && PyList_CheckExact(found.object)) {
+        read = PyList_GET_SIZE(found.object) == count;
         for (Py_ssize_t which = 0; read && which < count; which++) {
             Number number;
-            read = read_value(PyList_GET_ITEM(found, which), number) && std::isfinite(number.value);
+            read = read_value(PyList_GET_ITEM(found.object, which), number) && std::isfinite(number.value);
             numbers[which] = number.value;
         }
-    } else if (read && (read = open_floats(found, view, count, 0))) {
+    } else if (read && (read = open_floats(found.object, view, count, 0))) {
         std::memcpy(numbers, view.buf, static_cast<size_t>(count) * sizeof(double));
         read = std::all_of(numbers, numbers + count, [](double number) { return std::isfinite(number); });
         PyBuffer_Release(&view);
     }
-    Py_XDECREF(found);
     return read;
 }
 
 // Reads the number of the lane with the key that an attribute holds.
 bool read_lane(const Network *network, PyObject *object, PyObject *name, int &lane) {
-    PyObject *key = attribute(object, name);
-    if (!key) {
-        return false;
-    }
-    PyObject *found = PyDict_GetItemWithError(network->index, key);
+    const Ref key = attribute(object, name);
+    PyObject *found = key ? PyDict_GetItemWithError(network->index.object, key.object) : nullptr; // borrowed
     PyErr_Clear(); // such as a list, which is not hashable
     if (found) {
         lane = static_cast<int>(PyLong_AsLong(found));
     }
-    Py_DECREF(key);
-    return found != nullptr;
+    return found;
 }
 
 // Reads the lane on which an actor is, which must be the lane with its key.
 bool read_own_lane(const Network *network, Actor &actor) {
-    PyObject *lane = attribute(actor.object, s_lane);
-    bool known = lane && read_lane(network, actor.object, s_lane_index, actor.lane) &&
-                 PyList_GET_ITEM(network->objects, actor.lane) == lane;
-    Py_XDECREF(lane);
-    return known;
+    const Ref lane = attribute(actor.object, s_lane);
+    return lane && read_lane(network, actor.object, s_lane_index, actor.lane) &&
+           PyList_GET_ITEM(network->objects.object, actor.lane) == lane.object;
 }
 
 // Reads whether the first part of the route prescribes a lane. All parts must be usual, as each may become the first.
 bool read_route(Actor &actor) {
     actor.has_prescribed_lane = false;
-    PyObject *route = attribute(actor.object, s_route);
-    if (!route) {
-        return false;
-    }
-    bool read = route == Py_None || PyList_CheckExact(route);
+    const Ref found = attribute(actor.object, s_route);
+    PyObject *route = found.object;
+    bool read = route && (route == Py_None || PyList_CheckExact(route));
     for (Py_ssize_t part = 0; read && route != Py_None && part < PyList_GET_SIZE(route); part++) {
         PyObject *key = PyList_GET_ITEM(route, part);
         read = PyTuple_CheckExact(key) && PyTuple_GET_SIZE(key) == 3;
@@ -255,25 +252,23 @@ bool read_route(Actor &actor) {
             }
         }
     }
-    Py_DECREF(route);
     return read;
 }
 
 bool read_impact(Actor &actor) {
-    PyObject *impact = attribute(actor.object, s_impact);
+    const Ref impact = attribute(actor.object, s_impact);
     if (!impact) {
         return false;
     }
-    actor.has_impact = impact != Py_None;
+    actor.has_impact = impact.object != Py_None;
     Py_buffer view;
-    bool read = !actor.has_impact || open_floats(impact, view, 2, 0);
+    bool read = !actor.has_impact || open_floats(impact.object, view, 2, 0);
     if (read && actor.has_impact) {
         const double *values = static_cast<const double *>(view.buf);
         actor.impact_x = values[0];
         actor.impact_y = values[1];
         PyBuffer_Release(&view);
     }
-    Py_DECREF(impact);
     return read;
 }
 
@@ -288,19 +283,17 @@ bool read_action_value(PyObject *value, Number &number) {
 
 // Reads an action, and adds the address of its dictionary to a list.
 bool read_action(Actor &actor, std::vector<const void *> &actions) {
-    PyObject *action = attribute(actor.object, s_action);
-    bool read = action && PyDict_CheckExact(action);
-    if (read) {
-        PyObject *steering = PyDict_GetItemWithError(action, s_steering);
-        PyObject *acceleration = PyDict_GetItemWithError(action, s_acceleration);
-        PyErr_Clear();
-        read = steering && acceleration && read_action_value(steering, actor.steering) &&
-               read_action_value(acceleration, actor.acceleration);
-        actions.push_back(action);
-    }
-    Py_XDECREF(action);
+    const Ref action = attribute(actor.object, s_action);
     actor.new_action = actor.changed_action = false;
-    return read;
+    if (!action || !PyDict_CheckExact(action.object)) {
+        return false;
+    }
+    PyObject *steering = PyDict_GetItemWithError(action.object, s_steering);
+    PyObject *acceleration = PyDict_GetItemWithError(action.object, s_acceleration);
+    PyErr_Clear();
+    actions.push_back(action.object);
+    return steering && acceleration && read_action_value(steering, actor.steering) &&
+           read_action_value(acceleration, actor.acceleration);
 }
 
 bool is_finite(const Actor &actor) {
@@ -315,16 +308,15 @@ void turn(Actor &actor) {
 
 // Opens the array with the position of an actor, unless it is open.
 bool open_position(Actor &actor) {
-    PyObject *position = attribute(actor.object, s_position);
+    const Ref position = attribute(actor.object, s_position);
     if (!position) {
         return false;
     }
-    if (actor.is_open && actor.position.obj != position) {
+    if (actor.is_open && actor.position.obj != position.object) {
         PyBuffer_Release(&actor.position);
         actor.is_open = false;
     }
-    actor.is_open = actor.is_open || open_floats(position, actor.position, 2, PyBUF_WRITABLE);
-    Py_DECREF(position);
+    actor.is_open = actor.is_open || open_floats(position.object, actor.position, 2, PyBUF_WRITABLE);
     return actor.is_open;
 }
 
@@ -344,27 +336,25 @@ bool read_pose(Actor &actor) {
 }
 
 bool read_target_speed(Actor &actor) {
-    PyObject *found = attribute(actor.object, s_target_speed);
+    const Ref found = attribute(actor.object, s_target_speed);
     actor.target_speed = Number();
-    actor.has_target_speed = found != nullptr;
-    bool read = found ? read_value(found, actor.target_speed) : !actor.has_target;
-    Py_XDECREF(found);
+    actor.has_target_speed = bool(found);
+    const bool read = found ? read_value(found.object, actor.target_speed) : !actor.has_target;
     return read && std::isfinite(actor.target_speed.value);
 }
 
 // Reads the data that a linear vehicle has collected: a dictionary in which a part is missing or usual.
 bool read_data(Actor &actor) {
-    PyObject *data = attribute(actor.object, s_data);
-    bool read = data && PyDict_CheckExact(data);
+    const Ref data = attribute(actor.object, s_data);
+    bool read = data && PyDict_CheckExact(data.object);
     for (const char *name : {"longitudinal", "lateral"}) {
-        PyObject *part = read ? PyDict_GetItemString(data, name) : nullptr;
+        PyObject *part = read ? PyDict_GetItemString(data.object, name) : nullptr;
         for (const char *list : {"features", "outputs"}) {
             PyObject *found = part && PyDict_CheckExact(part) ? PyDict_GetItemString(part, list) : nullptr;
             read = read && (!part || (found && PyList_CheckExact(found)));
         }
     }
     PyErr_Clear();
-    Py_XDECREF(data);
     return read;
 }
 
@@ -428,7 +418,7 @@ bool are_different(std::vector<const void *> &pointers) {
 bool read_all(Traffic *self) {
     self->now++;
     std::vector<const void *> positions, actions; // a change of one that two actors share would change both
-    for (Actor &actor : *self->actors) {
+    for (Actor &actor : self->actors) {
         if (!read_pose(actor) || !read_bool(actor.object, s_check_collisions, actor.checks) ||
             !read_bool(actor.object, s_collidable, actor.collides) || !read_bool(actor.object, s_solid, actor.is_solid)) {
             return false;
@@ -446,65 +436,51 @@ bool read_all(Traffic *self) {
     return are_different(positions) && are_different(actions);
 }
 
-bool set(PyObject *object, PyObject *name, PyObject *value) { // takes the reference to the value
-    bool done = value && PyObject_SetAttr(object, name, value) == 0;
-    Py_XDECREF(value);
-    return done;
+bool set(PyObject *object, PyObject *name, const Ref &value) {
+    return value && PyObject_SetAttr(object, name, value.object) == 0;
 }
 
-PyObject *as_python(double value, bool as_numpy) {
-    PyObject *number = PyFloat_FromDouble(value);
-    if (!number || !as_numpy) {
-        return number;
-    }
-    PyObject *found = PyObject_CallOneArg(numpy_float, number);
-    Py_DECREF(number);
-    return found;
+Ref as_python(double value, bool as_numpy) {
+    Ref number(PyFloat_FromDouble(value));
+    return number && as_numpy ? Ref(PyObject_CallOneArg(numpy_float, number.object)) : std::move(number);
 }
 
 // A new array of NumPy.
-PyObject *as_array(const double *numbers, Py_ssize_t count) {
-    PyObject *array = PyObject_CallFunction(make_array, "n", count);
-    Py_buffer view;
-    if (array && PyObject_GetBuffer(array, &view, PyBUF_WRITABLE)) {
-        Py_CLEAR(array);
+Ref as_array(const double *numbers, Py_ssize_t count) {
+    Ref array(PyObject_CallFunction(make_array, "n", count));
+    Buffer buffer;
+    if (!array || !buffer.open(array.object, PyBUF_WRITABLE)) {
+        return Ref();
     }
-    if (array) {
-        std::memcpy(view.buf, numbers, static_cast<size_t>(count) * sizeof(double));
-        PyBuffer_Release(&view);
-    }
+    std::memcpy(buffer.bytes(), numbers, static_cast<size_t>(count) * sizeof(double));
     return array;
 }
 
-PyObject *as_python(const Number &number) { return as_python(number.value, number.is_numpy); }
+Ref as_python(const Number &number) { return as_python(number.value, number.is_numpy); }
 
 // Writes the results of decisions.
 bool publish_decision(Traffic *self, Actor &actor) {
     if (actor.changed_target) {
-        PyObject *key = PyList_GET_ITEM(self->network->keys, actor.target);
+        PyObject *key = PyList_GET_ITEM(self->network->keys.object, actor.target);
         if (PyObject_SetAttr(actor.object, s_target_lane_index, key)) {
             return false;
         }
         actor.changed_target = false;
     }
     if (actor.reset_timer) {
-        if (!set(actor.object, s_timer, PyLong_FromLong(0))) {
+        if (!set(actor.object, s_timer, Ref(PyLong_FromLong(0)))) {
             return false;
         }
         actor.reset_timer = false;
     }
     if (actor.new_action || actor.changed_action) {
-        PyObject *steering = as_python(actor.steering);
-        PyObject *acceleration = as_python(actor.acceleration);
-        PyObject *action = actor.new_action ? PyDict_New() : PyObject_GetAttr(actor.object, s_action);
-        bool done = steering && acceleration && action && PyDict_SetItem(action, s_steering, steering) == 0 &&
-                    PyDict_SetItem(action, s_acceleration, acceleration) == 0 &&
-                    (!actor.new_action || PyObject_SetAttr(actor.object, s_action, action) == 0);
-        Py_XDECREF(steering);
-        Py_XDECREF(acceleration);
-        Py_XDECREF(action);
+        const Ref steering = as_python(actor.steering), acceleration = as_python(actor.acceleration);
+        const Ref action(actor.new_action ? PyDict_New() : PyObject_GetAttr(actor.object, s_action));
+        const bool is_new = actor.new_action;
         actor.new_action = actor.changed_action = false;
-        return done;
+        return steering && acceleration && action && PyDict_SetItem(action.object, s_steering, steering.object) == 0 &&
+               PyDict_SetItem(action.object, s_acceleration, acceleration.object) == 0 &&
+               (!is_new || PyObject_SetAttr(actor.object, s_action, action.object) == 0);
     }
     return true;
 }
@@ -531,14 +507,14 @@ bool publish_movement(Traffic *self, Actor &actor) {
     if (!set(object, s_heading, as_python(actor.heading, true)) || !set(object, s_speed, as_python(actor.speed))) {
         return false;
     }
-    if (PyObject_SetAttr(object, s_lane_index, PyList_GET_ITEM(self->network->keys, actor.lane)) ||
-        PyObject_SetAttr(object, s_lane, PyList_GET_ITEM(self->network->objects, actor.lane))) {
+    if (PyObject_SetAttr(object, s_lane_index, PyList_GET_ITEM(self->network->keys.object, actor.lane)) ||
+        PyObject_SetAttr(object, s_lane, PyList_GET_ITEM(self->network->objects.object, actor.lane))) {
         return false;
     }
     // After an error, an actor may have reset its timer since its last movement.
     const bool is_whole = actor.timer.is_whole && !actor.timer.is_numpy;
     if (actor.changes_lanes &&
-        !set(object, s_timer, is_whole ? PyLong_FromDouble(actor.timer.value) : as_python(actor.timer))) {
+        !set(object, s_timer, is_whole ? Ref(PyLong_FromDouble(actor.timer.value)) : as_python(actor.timer))) {
         return false;
     }
     return true;
@@ -553,7 +529,7 @@ bool publish_contact(Actor &actor) {
         return false;
     }
     const double impact[2] = {actor.impact_x, actor.impact_y};
-    if (actor.new_impact && !set(actor.object, s_impact, actor.has_impact ? as_array(impact, 2) : Py_NewRef(Py_None))) {
+    if (actor.new_impact && !set(actor.object, s_impact, actor.has_impact ? as_array(impact, 2) : Ref(Py_NewRef(Py_None)))) {
         return false;
     }
     actor.new_crash = actor.new_hit = actor.new_impact = false;
@@ -561,7 +537,7 @@ bool publish_contact(Actor &actor) {
 }
 
 bool publish_all(Traffic *self, bool moved) {
-    for (Actor &actor : *self->actors) {
+    for (Actor &actor : self->actors) {
         if (!publish_contact(actor)) {
             return false;
         }

@@ -141,11 +141,10 @@ bool handle_collision(Traffic *self, Actor &one, Actor &two, PyObject *dt) {
             return false;
         }
     }
-    PyObject *done = PyObject_CallMethodObjArgs(one.object, s_handle_collisions, two.object, dt, nullptr);
+    const Ref done(PyObject_CallMethodObjArgs(one.object, s_handle_collisions, two.object, dt, nullptr));
     if (!done) {
         return false;
     }
-    Py_DECREF(done);
     for (Actor *actor : {&one, &two}) {
         if (actor->moves && (!read_bool(actor->object, s_crashed, actor->crashed) || !read_impact(*actor))) {
             PyErr_SetString(PyExc_RuntimeError, "highway-env's handle_collisions set an unknown value");
@@ -158,7 +157,7 @@ bool handle_collision(Traffic *self, Actor &one, Actor &two, PyObject *dt) {
 // Finds the pairs that may touch, in the order in which highway-env checks them. Only pairs near each other along x are
 // compared: the search sorts by x.
 std::vector<std::pair<size_t, size_t>> find_pairs(Traffic *self, double dt) {
-    const std::vector<Actor> &actors = *self->actors;
+    const std::vector<Actor> &actors = self->actors;
     std::vector<std::pair<double, size_t>> sorted;
     double radius = 0, speed = 0;
     for (size_t row = 0; row < actors.size(); row++) {
@@ -188,7 +187,7 @@ std::vector<std::pair<size_t, size_t>> find_pairs(Traffic *self, double dt) {
 // The part of `Road.step` after the movement. False: an error.
 bool collide_all(Traffic *self, double dt, PyObject *as_object) {
     for (const auto &[row, other] : find_pairs(self, dt)) { // a collision changes no position and no speed
-        Actor &one = (*self->actors)[row], &two = (*self->actors)[other];
+        Actor &one = self->actors[row], &two = self->actors[other];
         const Contact contact = contact_of(one, two, dt);
         if (contact.is_known) {
             collide(one, two, contact);

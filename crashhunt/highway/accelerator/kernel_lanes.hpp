@@ -90,14 +90,17 @@ struct Lane {
 typedef std::vector<std::pair<int, double>> Connections; // lanes, each with the offset of its coordinates in m
 
 struct Network {
-    PyObject_HEAD
-    std::vector<Lane> *lanes;
-    std::vector<Connections> *connected; // by lane; empty if the road does not search connected lanes
-    PyObject *keys;    // the list of keys
-    PyObject *objects; // the list of highway-env's lanes
-    PyObject *index;   // from a key to the number of its lane
+    std::vector<Lane> lanes;
+    std::vector<Connections> connected; // by lane; empty if the road does not search connected lanes
+    Ref keys;    // the list of keys
+    Ref objects; // the list of highway-env's lanes
+    Ref index;   // from a key to the number of its lane
 
-    const Lane &lane(int number) const { return (*lanes)[static_cast<size_t>(number)]; }
+    const Lane &lane(int number) const { return lanes[static_cast<size_t>(number)]; }
 };
+struct NetworkObject {
+    PyObject_HEAD Network *network;
+};
+PyTypeObject *network_type = nullptr;
 
 } // namespace

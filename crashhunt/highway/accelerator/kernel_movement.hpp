@@ -31,7 +31,7 @@ void clip_actions(Actor &actor) {
 }
 
 int closest_lane(Traffic *self, size_t row) {
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     int nearest = 0;
     double least = std::numeric_limits<double>::infinity(), angle = 0, of_heading = NAN;
     for (int number = 0; number < static_cast<int>(self->lanes); number++) {
@@ -123,11 +123,10 @@ bool slide_vehicle(Traffic *self, Actor &actor, PyObject *dt) {
     if (!publish_contact(actor) || !publish_decision(self, actor) || !publish_movement(self, actor)) {
         return false;
     }
-    PyObject *done = PyObject_CallFunctionObjArgs(slide, actor.object, dt, nullptr);
+    const Ref done(PyObject_CallFunctionObjArgs(slide, actor.object, dt, nullptr));
     if (!done) {
         return false;
     }
-    Py_DECREF(done);
     int lane = actor.lane; // is searched afterwards, for all vehicles
     std::vector<const void *> actions;
     read_pose(actor); // false for numbers that are not finite, which `move_all` reports
@@ -169,7 +168,7 @@ Moved move_all(Traffic *self, double dt, PyObject *as_object) {
     bool finite = true;
     size_t row = 0;
     for (; row < self->vehicles; row++) {
-        Actor &actor = (*self->actors)[row];
+        Actor &actor = self->actors[row];
         if (!actor.slides) {
             move(actor, dt);
         } else if (!slide_in_kernel(actor, dt) && !slide_vehicle(self, actor, as_object)) {
@@ -179,7 +178,7 @@ Moved move_all(Traffic *self, double dt, PyObject *as_object) {
     }
     self->now++;
     for (size_t moved = 0; finite && moved < row; moved++) {
-        Actor &actor = (*self->actors)[moved];
+        Actor &actor = self->actors[moved];
         turn(actor);
         actor.lane = closest_lane(self, moved);
     }

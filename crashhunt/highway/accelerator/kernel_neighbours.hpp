@@ -10,17 +10,17 @@ namespace {
 
 void coordinates(Traffic *self, size_t row, int lane, double &s, double &r) {
     size_t at = row * self->lanes + static_cast<size_t>(lane);
-    if ((*self->stamps)[at] != self->now) {
-        const Actor &actor = (*self->actors)[row];
-        self->network->lane(lane).local_coordinates(actor.x, actor.y, (*self->along)[at], (*self->across)[at]);
-        (*self->stamps)[at] = self->now;
+    if (self->stamps[at] != self->now) {
+        const Actor &actor = self->actors[row];
+        self->network->lane(lane).local_coordinates(actor.x, actor.y, self->along[at], self->across[at]);
+        self->stamps[at] = self->now;
     }
-    s = (*self->along)[at];
-    r = (*self->across)[at];
+    s = self->along[at];
+    r = self->across[at];
 }
 
 double lane_distance(Traffic *self, size_t row, size_t other) {
-    int lane = (*self->actors)[row].lane;
+    int lane = self->actors[row].lane;
     double s, other_s, r;
     coordinates(self, other, lane, other_s, r);
     coordinates(self, row, lane, s, r);
@@ -29,17 +29,17 @@ double lane_distance(Traffic *self, size_t row, size_t other) {
 
 // The actors that highway-env's `neighbour_vehicles` compares on a lane, in order. Positions stay while vehicles decide.
 const std::vector<std::pair<double, size_t>> &queue_of(Traffic *self, int number) {
-    Queue &queue = (*self->queues)[static_cast<size_t>(number)];
+    Queue &queue = self->queues[static_cast<size_t>(number)];
     if (queue.instant == self->now) {
         return queue.places;
     }
     queue.instant = self->now;
     queue.places.clear();
     const Connections only = {{number, 0.0}};
-    const auto &all = *self->network->connected;
+    const auto &all = self->network->connected;
     const Connections &searched = all.empty() ? only : all[static_cast<size_t>(number)];
-    for (size_t row = 0; row < self->actors->size(); row++) {
-        if ((*self->actors)[row].is_landmark) {
+    for (size_t row = 0; row < self->actors.size(); row++) {
+        if (self->actors[row].is_landmark) {
             continue;
         }
         for (const auto &[lane, offset] : searched) {

@@ -5,9 +5,20 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include <algorithm>
 #include <cmath>
+#include <cstring>
+#include <memory>
+#include <optional>
+#include <string>
+#include <tuple>
+#include <type_traits>
+#include <utility>
+#include <vector>
 
 namespace {
+
+#include "../../native/python.hpp"
 
 // The beginning of NumPy's `PyUFuncObject`, which is a part of NumPy's stable interface.
 typedef void (*Loop)(char **, const Py_ssize_t *, const Py_ssize_t *, void *);
@@ -22,14 +33,14 @@ struct UFunc {
 };
 const char DOUBLE = 12; // NumPy's number of the type float64
 
-struct Function {
+struct NumpyFunction {
     Loop loop;
     void *data;
 };
 enum { SIN, COS, TAN, ARCSIN, ARCTAN, ARCTAN2, POWER, FUNCTIONS };
 const char *const NAMES[FUNCTIONS] = {"sin", "cos", "tan", "arcsin", "arctan", "arctan2", "power"};
 
-Function functions[FUNCTIONS];
+NumpyFunction functions[FUNCTIONS];
 bool fused = false;           // whether NumPy's scalar product of two vectors uses fused multiply-adds
 bool product_fused = false;   // whether NumPy's product of two matrices does
 // How NumPy multiplies a matrix by a vector: UNKNOWN, rounding both products of a row, or only one of them.

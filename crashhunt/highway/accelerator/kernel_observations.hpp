@@ -17,7 +17,7 @@ struct Scale {
 
 // `Road.close_objects_to` without a limit to their number: the rows of objects within a distance (m) of a vehicle.
 std::vector<size_t> close_objects_to(Traffic *self, size_t row, double limit, bool sees_behind, bool is_sorted, size_t count) {
-    const std::vector<Actor> &actors = *self->actors;
+    const std::vector<Actor> &actors = self->actors;
     const Actor &observer = actors[row];
     std::vector<std::pair<double, size_t>> found;
     for (size_t other = 0; other < count; other++) {
@@ -42,15 +42,14 @@ std::vector<size_t> close_objects_to(Traffic *self, size_t row, double limit, bo
 
 // Whether the end of a vehicle's route is on the road; otherwise highway-env raises an error.
 bool arrives(const Network *network, const Actor &actor) {
-    PyObject *route = attribute(actor.object, s_route);
-    bool found = !route || route == Py_None;
-    if (!found && PyList_CheckExact(route)) {
-        const Py_ssize_t parts = PyList_GET_SIZE(route);
-        PyObject *last = parts ? PyList_GET_ITEM(route, parts - 1) : nullptr;
-        found = !last || (PyTuple_CheckExact(last) && PyTuple_GET_SIZE(last) == 3 && lane_of_part(network, last, 0) >= 0);
+    const Ref route = attribute(actor.object, s_route);
+    if (!route || route.object == Py_None) {
+        return true;
     }
-    Py_XDECREF(route);
-    return found;
+    const Py_ssize_t parts = PyList_CheckExact(route.object) ? PyList_GET_SIZE(route.object) : -1;
+    PyObject *last = parts > 0 ? PyList_GET_ITEM(route.object, parts - 1) : nullptr;
+    return last ? PyTuple_CheckExact(last) && PyTuple_GET_SIZE(last) == 3 && lane_of_part(network, last, 0) >= 0
+                : parts == 0;
 }
 
 double feature(const Actor &actor, int which) {

@@ -18,7 +18,7 @@ double desired_gap(const Actor &driver, const Actor &ego, const Actor &front) {
 
 // `IDMVehicle.acceleration`
 double idm_acceleration(Traffic *self, size_t driver_row, size_t ego_row, size_t front) {
-    const std::vector<Actor> &actors = *self->actors;
+    const std::vector<Actor> &actors = self->actors;
     const Actor &driver = actors[driver_row];
     const Parameters &parameters = driver.parameters;
     if (ego_row == NO_ROW || !actors[ego_row].moves) {
@@ -46,12 +46,12 @@ void acceleration_features(Traffic *self, const Parameters &parameters, size_t e
     if (ego_row == NO_ROW) {
         return;
     }
-    const Actor &ego = (*self->actors)[ego_row];
+    const Actor &ego = self->actors[ego_row];
     double speed = ego.speed.value;
     features[0] = (ego.has_target_speed ? ego.target_speed.value : speed) - speed;
     if (front != NO_ROW) {
         double safe = parameters.distance_wanted + (speed > 0 ? speed : 0.0) * parameters.time_wanted;
-        double faster = (*self->actors)[front].speed.value - speed;
+        double faster = self->actors[front].speed.value - speed;
         double farther = lane_distance(self, ego_row, front) - safe;
         features[1] = 0 < faster ? 0 : faster;
         features[2] = 0 < farther ? 0 : farther;
@@ -59,7 +59,7 @@ void acceleration_features(Traffic *self, const Parameters &parameters, size_t e
 }
 
 double acceleration(Traffic *self, size_t driver_row, size_t ego_row, size_t front_row) {
-    const Actor &driver = (*self->actors)[driver_row];
+    const Actor &driver = self->actors[driver_row];
     if (driver.model != LINEAR) {
         return idm_acceleration(self, driver_row, ego_row, front_row);
     }
@@ -70,7 +70,7 @@ double acceleration(Traffic *self, size_t driver_row, size_t ego_row, size_t fro
 
 // `LinearVehicle.steering_features`
 void steering_features(Traffic *self, size_t row, double *features) {
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     double s, r, length = actor.parameters.length, speed = not_zero(actor.speed.value);
     coordinates(self, row, actor.target, s, r);
     double ahead = self->network->lane(actor.target).heading_at(s + actor.speed.value * actor.parameters.tau_pursuit);
@@ -79,7 +79,7 @@ void steering_features(Traffic *self, size_t row, double *features) {
 }
 
 double steering_control(Traffic *self, size_t row) {
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     const Parameters &parameters = actor.parameters;
     double angle;
     if (actor.model == LINEAR) {
@@ -103,7 +103,7 @@ int sign_of(long x) { return (x > 0) - (x < 0); }
 
 // `IDMVehicle.mobil`
 bool mobil(Traffic *self, size_t row, int number) {
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     const Parameters &parameters = actor.parameters;
     size_t new_front, new_rear, old_front, old_rear;
     neighbour_vehicles(self, row, number, new_front, new_rear);
@@ -130,7 +130,7 @@ bool mobil(Traffic *self, size_t row, int number) {
 
 // `IDMVehicle.change_lane_policy`
 void change_lane_policy(Traffic *self, size_t row) {
-    std::vector<Actor> &actors = *self->actors;
+    std::vector<Actor> &actors = self->actors;
     const Network &network = *self->network;
     Actor &actor = actors[row];
     if (actor.lane != actor.target) {
@@ -175,7 +175,7 @@ void change_lane_policy(Traffic *self, size_t row) {
 
 // Lets highway-env choose the next lane at the end of the target lane. False: it has raised an error.
 bool follow_road(Traffic *self, size_t row) {
-    Actor &actor = (*self->actors)[row];
+    Actor &actor = self->actors[row];
     double s, r;
     coordinates(self, row, actor.target, s, r);
     if (!(s > self->network->lane(actor.target).length - 5 / 2.)) {
@@ -187,11 +187,10 @@ bool follow_road(Traffic *self, size_t row) {
     double *place = static_cast<double *>(actor.position.buf);
     place[0] = actor.x;
     place[1] = actor.y;
-    PyObject *done = PyObject_CallMethodNoArgs(actor.object, s_follow_road);
+    const Ref done(PyObject_CallMethodNoArgs(actor.object, s_follow_road));
     if (!done) {
         return false;
     }
-    Py_DECREF(done);
     if (!read_lane(self->network, actor.object, s_target_lane_index, actor.target) || !read_route(actor)) {
         PyErr_SetString(PyExc_RuntimeError, "highway-env's follow_road returned an unknown lane");
         return false;
@@ -203,10 +202,8 @@ bool follow_road(Traffic *self, size_t row) {
 bool append_data(PyObject *data, const char *name, const double *features, Py_ssize_t count, double output) {
     PyObject *part = PyDict_GetItemString(data, name); // borrowed
     if (!part) {
-        PyObject *made = Py_BuildValue("{s[]s[]}", "features", "outputs");
-        bool stored = made && PyDict_SetItemString(data, name, made) == 0;
-        Py_XDECREF(made);
-        part = stored ? PyDict_GetItemString(data, name) : nullptr;
+        const Ref made(Py_BuildValue("{s[]s[]}", "features", "outputs"));
+        part = made && PyDict_SetItemString(data, name, made.object) == 0 ? PyDict_GetItemString(data, name) : nullptr;
     }
     PyObject *all = part && PyDict_CheckExact(part) ? PyDict_GetItemString(part, "features") : nullptr;
     PyObject *outputs = all ? PyDict_GetItemString(part, "outputs") : nullptr;
@@ -216,32 +213,28 @@ bool append_data(PyObject *data, const char *name, const double *features, Py_ss
         }
         return false;
     }
-    PyObject *array = as_array(features, count), *number = as_python(output, true);
-    bool done = array && number && PyList_Append(all, array) == 0 && PyList_Append(outputs, number) == 0;
-    Py_XDECREF(array);
-    Py_XDECREF(number);
-    return done;
+    const Ref array = as_array(features, count), number = as_python(output, true);
+    return array && number && PyList_Append(all, array.object) == 0 && PyList_Append(outputs, number.object) == 0;
 }
 
 // `LinearVehicle.collect_data`. False: an error.
 bool collect_data(Traffic *self, size_t row) {
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     size_t front, rear;
     neighbour_vehicles(self, row, actor.lane, front, rear);
     double pursuit[3], steering[2];
     acceleration_features(self, actor.parameters, row, front, pursuit);
     steering_features(self, row, steering);
     const double *of_steering = actor.steering_parameters;
-    PyObject *data = PyObject_GetAttr(actor.object, s_data);
-    bool done = data && append_data(data, "longitudinal", pursuit, 3, dot(actor.acceleration_parameters, pursuit)) &&
-                append_data(data, "lateral", steering, 2, dot(of_steering[0], of_steering[1], steering[0], steering[1]));
-    Py_XDECREF(data);
-    return done;
+    const Ref data(PyObject_GetAttr(actor.object, s_data));
+    return data &&
+           append_data(data.object, "longitudinal", pursuit, 3, dot(actor.acceleration_parameters, pursuit)) &&
+           append_data(data.object, "lateral", steering, 2, dot(of_steering[0], of_steering[1], steering[0], steering[1]));
 }
 
 // Decides for one vehicle, as its method `act` does. False: an error.
 bool act(Traffic *self, size_t row) {
-    Actor &actor = (*self->actors)[row];
+    Actor &actor = self->actors[row];
     if (actor.model == LINEAR && actor.collects_data && !collect_data(self, row)) {
         return false;
     }

@@ -30,22 +30,18 @@ Answer is_below(double value, double limit) {
 // The number of the lane of one part of a route; -1 if highway-env must decide. A vehicle keeps the number of its own
 // lane on a part that leaves it open.
 int lane_of_part(const Network *network, PyObject *part, long own) {
-    PyObject *key = nullptr;
-    if (PyTuple_GET_ITEM(part, 2) == Py_None) {
-        key = Py_BuildValue("OOl", PyTuple_GET_ITEM(part, 0), PyTuple_GET_ITEM(part, 1), own);
-    } else {
-        key = Py_NewRef(part);
-    }
-    PyObject *found = key ? PyDict_GetItemWithError(network->index, key) : nullptr; // borrowed
+    const bool is_open = PyTuple_GET_ITEM(part, 2) == Py_None;
+    const Ref key(is_open ? Py_BuildValue("OOl", PyTuple_GET_ITEM(part, 0), PyTuple_GET_ITEM(part, 1), own)
+                          : Py_NewRef(part));
+    PyObject *found = key ? PyDict_GetItemWithError(network->index.object, key.object) : nullptr; // borrowed
     PyErr_Clear();
-    Py_XDECREF(key);
     return found ? static_cast<int>(PyLong_AsLong(found)) : -1;
 }
 
 // `ControlledVehicle.predict_trajectory_constant_speed`. False: highway-env must decide.
 bool foresee(Traffic *self, size_t row, PyObject *route, Path &path) {
     const Network &network = *self->network;
-    const Actor &actor = (*self->actors)[row];
+    const Actor &actor = self->actors[row];
     const Py_ssize_t parts = route == Py_None ? 0 : PyList_GET_SIZE(route);
     double s, r;
     coordinates(self, row, actor.lane, s, r);
@@ -110,10 +106,10 @@ Answer is_conflict_possible(const Actor &one, const Path &path, const Actor &two
 
 // `Vehicle.predict_trajectory_constant_speed`. False: highway-env must decide.
 bool foresee_passive(const Actor &actor, Path &path) {
-    PyObject *kind = attribute(actor.object, s_prediction_type);
-    const bool is_straight = kind && PyUnicode_Check(kind) && !PyUnicode_CompareWithASCIIString(kind, "zero_steering");
-    const bool is_turning = kind && PyUnicode_Check(kind) && !PyUnicode_CompareWithASCIIString(kind, "constant_steering");
-    Py_XDECREF(kind);
+    const Ref kind = attribute(actor.object, s_prediction_type);
+    const bool is_text = kind && PyUnicode_Check(kind.object);
+    const bool is_straight = is_text && !PyUnicode_CompareWithASCIIString(kind.object, "zero_steering");
+    const bool is_turning = is_text && !PyUnicode_CompareWithASCIIString(kind.object, "constant_steering");
     if (!is_straight && !is_turning) {
         return false; // raises an error
     }
@@ -135,12 +131,11 @@ bool foresee_passive(const Actor &actor, Path &path) {
 std::vector<Path> predict_all(Traffic *self) {
     std::vector<Path> paths(self->vehicles);
     for (size_t row = 0; row < self->vehicles; row++) {
-        const Actor &actor = (*self->actors)[row];
+        const Actor &actor = self->actors[row];
         bool done;
         if (actor.has_target) {
-            PyObject *route = attribute(actor.object, s_route);
-            done = route && foresee(self, row, route, paths[row]);
-            Py_XDECREF(route);
+            const Ref route = attribute(actor.object, s_route);
+            done = route && foresee(self, row, route.object, paths[row]);
         } else {
             done = foresee_passive(actor, paths[row]);
         }
@@ -175,7 +170,7 @@ enum { APART, SAME_LANES, OTHER_LANES };
 
 // `compute_ttc_grid` for one speed of the observer and one other vehicle
 void fill_times(Traffic *self, const TimeGrid &grid, size_t row, size_t other, Py_ssize_t which, double speed, int relation) {
-    const Actor &one = (*self->actors)[row], &two = (*self->actors)[other];
+    const Actor &one = self->actors[row], &two = self->actors[other];
     if (other == row || speed == two.speed.value || relation == APART) {
         return;
     }

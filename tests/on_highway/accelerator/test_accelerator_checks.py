@@ -424,8 +424,8 @@ def test_kernel_is_bound_with_the_first_rounding_that_is_numpys(monkeypatch):
     """All ways are tried, each once; what has been found stays bound."""
     bound, right = [], _kernel.kernel()
 
-    def compute(name, *numbers):
-        return right.compute(name, *numbers) if bound[-1][-3:] == wanted or name == "turned" else float("nan")
+    def compute(name, numbers):
+        return right.compute(name, numbers) if bound[-1][-3:] == wanted or name == "turned" else float("nan")
 
     module = SimpleNamespace(
         INTERFACE=_kernel._INTERFACE, bind=lambda *given: bound.append(given), compute=compute,
@@ -442,7 +442,7 @@ def test_kernel_is_bound_with_the_first_rounding_that_is_numpys(monkeypatch):
 def test_functions_are_compared_on_many_numbers_of_all_magnitudes():
     asked, right = {}, _kernel.kernel()
     module = SimpleNamespace(
-        compute=lambda name, *numbers: asked.setdefault(name, []).append(numbers) or right.compute(name, *numbers)
+        compute=lambda name, numbers: asked.setdefault(name, []).append(numbers) or right.compute(name, numbers)
     )
     assert _kernel._differs(module) == ""
     counts = {name: len(found) for name, found in asked.items()}
@@ -557,7 +557,7 @@ def test_one_example_of_each_class_shows_its_parameters_and_all_that_have_their_
 def test_things_are_plain_where_each_has_its_own_usual_position(change):
 
     def are_plain(things):
-        return _kernel_objects._are_plain(things, _supported.kinds_of(things))
+        return _kernel_objects.are_plain(things, _supported.kinds_of(things))
 
     things = small_road(*[IDMVehicle] * 3).vehicles
     assert are_plain(things)
