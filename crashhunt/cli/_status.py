@@ -20,7 +20,14 @@ if TYPE_CHECKING:
 
 _COLUMNS_WITHOUT_TERMINAL = 120
 _NUMBERS = ("trials", "pace", "left", "crashes", "errors")  # columns
-_OMITTED_FIRST = ("pace", "errors", "left", "outcomes")  # columns that a narrow terminal does not show
+_OMITTED_FIRST = (
+    "pace",
+    "errors",
+    "left",
+    "outcomes",
+    "crashes",
+    "trials",
+)  # columns that do not fit a narrow terminal
 _MIN_NAME_COLUMNS = 12  # of the name of a hunt, which is folded
 _WIDEST = 10_000
 _MAX_NOTES = 3  # of a hunt, the latest ones
@@ -96,7 +103,7 @@ class _FittingTable:
         table, wide = _table(self._states), options.update(max_width=_WIDEST)
         for count in range(1, len(_OMITTED_FIRST) + 1):
             folded = max(0, _longest_name(self._states) - _MIN_NAME_COLUMNS)
-            if Measurement.get(console, wide, table).minimum - folded <= options.max_width:
+            if Measurement.get(console, wide, table).minimum - folded <= options.max_width + 1:  # its edge is blank
                 break
             table = _table(self._states, _OMITTED_FIRST[:count])
         yield table

@@ -166,6 +166,8 @@ def test_table_without_terminal_has_120_columns():
         (66, {"left", "outcomes"}),
         (60, {"outcomes"}),
         (40, set()),
+        (30, {"no crashes"}),
+        (22, {"no crashes", "no trials"}),
     ],
 )
 def test_narrow_terminal_shows_fewer_columns_and_no_cut_number(columns, kept):
@@ -174,8 +176,11 @@ def test_narrow_terminal_shows_fewer_columns_and_no_cut_number(columns, kept):
         seconds_left=90, outcomes={"collision": 28, "finished": 12},
     )  # fmt: skip
     header, _, *rows = written(state, width=columns)
-    assert set(header.split()) == {"hunt", "state", "trials", "crashes", *kept}
-    assert {"hunts/one", "finished", "40/40", "28"} <= set(rows[0].split())
+    values = {"trials": "40/40", "crashes": "28"}
+    shown = {name for name in values if f"no {name}" not in kept}
+    kept = {name for name in kept if not name.startswith("no ")}
+    assert set(header.split()) == {"hunt", "state", *shown, *kept}
+    assert {"hunts/one", "finished", *(values[name] for name in shown)} <= set(rows[0].split())
     assert ("collision 28" in rows[0]) == ("outcomes" in kept)
     assert ("5.9 s/trial" in rows[0]) == ("pace" in kept)
     assert all(len(row) <= columns for row in rows)
