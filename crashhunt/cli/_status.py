@@ -20,14 +20,7 @@ if TYPE_CHECKING:
 
 _COLUMNS_WITHOUT_TERMINAL = 120
 _NUMBERS = ("trials", "pace", "left", "crashes", "errors")  # columns
-_OMITTED_FIRST = (
-    "pace",
-    "errors",
-    "left",
-    "outcomes",
-    "crashes",
-    "trials",
-)  # columns that do not fit a narrow terminal
+_OMITTED_FIRST = ("pace", "errors", "left", "outcomes", "crashes", "trials")  # columns, in a narrow terminal
 _MIN_NAME_COLUMNS = 12  # of the name of a hunt, which is folded
 _WIDEST = 10_000
 _MAX_NOTES = 3  # of a hunt, the latest ones
