@@ -44,6 +44,9 @@ def test_in_a_queue_it_is_the_time_gap():
     assert steps[:60] == pytest.approx(math.exp(-1 / 1.2), abs=0.02)
     assert (most.agent, most.other) == ("ego", "other")
     assert level(straight(0, 0, 0, 10), straight(25, 0, 0, 10))[0].max() == pytest.approx(math.exp(-2 / 1.2), abs=0.02)
+    above = np.tile((0.0, 6.0, 0.0, 0.0), (100, 1))  # on a bridge above a road at height 0
+    queue = frame(straight(0, 0, 0, 10), straight(15, 0, 0, 10))
+    assert dangers([queue._replace(heights=above)], ["ego"], 0.1)[0].max() == 0.0
 
 
 def test_who_closes_in_from_behind_is_a_danger_of_its_own():
