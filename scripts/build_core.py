@@ -16,6 +16,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,11 @@ class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take
             ("fixed order of SUMO's links", build_link_order),
             ("native stacks of dying trials", build_native_stack),
         )
-        for what, compile_part in parts:
+        with ThreadPoolExecutor() as pool:  # each thread waits for a compiler
+            made = [(what, pool.submit(compile_part, Path(self.root), self._folder)) for what, compile_part in parts]
+        for what, compiled in made:
             try:
-                built = compile_part(Path(self.root), self._folder)
+                built = compiled.result()
             except (OSError, subprocess.SubprocessError, ValueError) as error:
                 if asked == "1":
                     raise
