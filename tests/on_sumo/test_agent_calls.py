@@ -43,10 +43,12 @@ def simulator(tmp_path_factory):
 def driven(simulator, call, place="act", steps=6, oracles=(), overruled=None):
     values = argument_values(load_scenario("loop"))
     spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=values, max_steps=steps)
-    agent = Calls(call, place)
-    if overruled is not None:
-        agent = overruled_agent(agent, simulator, overruled)
-    with Episode(spec, simulator=simulator, make_agent=lambda *_: agent, oracles=oracles) as episode:
+
+    def make_agent(*_):  # once there is a network
+        agent = Calls(call, place)
+        return agent if overruled is None else overruled_agent(agent, simulator, overruled)
+
+    with Episode(spec, simulator=simulator, make_agent=make_agent, oracles=oracles) as episode:
         result = episode.start()
         while result is None:
             result = episode.step()
