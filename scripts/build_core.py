@@ -16,11 +16,14 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 # Without contraction every expression rounds as Python's does; sine and cosine are the C library's, each by itself.
 FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off",
@@ -47,39 +50,77 @@ class CoreHook(BuildHookInterface):  # type: ignore[type-arg]  # older ones take
             ("fixed order of SUMO's links", build_link_order),
             ("native stacks of dying trials", build_native_stack),
         )
-        with ThreadPoolExecutor() as pool:  # each thread waits for a compiler
-            made = [(what, pool.submit(compile_part, Path(self.root), self._folder)) for what, compile_part in parts]
-        for what, compiled in made:
-            try:
-                built = compiled.result()
-            except (OSError, subprocess.SubprocessError, ValueError) as error:
-                if asked == "1":
-                    raise
-                self.app.display_warning(f"crashhunt goes without its {what}: {error}")
-                continue
-            where = "force_include_editable" if version == "editable" else "force_include"
-            build_data[where][str(built)] = built.name
-            build_data["pure_python"] = False
-            build_data["infer_tag"] = True
+        begun = []
+        with ExitStack() as running:
+            for what, begin in parts:
+                with self._warned(what):
+                    begun.append((what, running.enter_context(begin(Path(self.root), self._folder))))
+            for what, compilation in begun:
+                with self._warned(what):
+                    built = compilation.finish()
+                    where = "force_include_editable" if version == "editable" else "force_include"
+                    build_data[where][str(built)] = built.name
+                    build_data["pure_python"] = False
+                    build_data["infer_tag"] = True
+
+    @contextmanager
+    def _warned(self, what: str) -> Iterator[None]:
+        """Return a context in which a part that cannot be built is excluded, with a warning."""
+        try:
+            yield
+        except (OSError, subprocess.SubprocessError, ValueError) as error:
+            if os.environ.get("CRASHHUNT_CORE") == "1":
+                raise
+            self.app.display_warning(f"crashhunt goes without its {what}: {error}")
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was built."""
         shutil.rmtree(getattr(self, "_folder", ""), ignore_errors=True)
 
 
-def build(root: Path, folder: Path) -> Path:
-    """Compile the core into a folder; return the file.
+class Compilation:
+    """A compiler that runs, while others may run too.
+
+    Args:
+        words: the command.
+        built: the file that it writes.
+    """
+
+    def __init__(self, words: list[str], built: Path) -> None:
+        self._built = built
+        self._compiler = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._compiler:  # which waits for its end
+            self._compiler.kill()
+
+    def finish(self) -> Path:
+        """Wait for the end of the compiler; return the file.
+
+        Raises:
+            subprocess.SubprocessError: it fails, such as where Python's headers are missing, or takes ten minutes.
+        """
+        _, said = self._compiler.communicate(timeout=600)
+        if self._compiler.returncode:
+            raise subprocess.SubprocessError(f"the compiler says: {said.strip()[-2000:]}")
+        return self._built
+
+
+def build(root: Path, folder: Path) -> Compilation:
+    """Begin to compile the core into a folder.
 
     Raises:
         ValueError: it is for Linux and CPython only.
         OSError: there is no compiler.
-        subprocess.SubprocessError: it fails, such as where Python's headers are missing.
     """
     return _compile(root / "crashhunt" / "native", "core.cpp", "_core.py", folder / _module("_crashhunt_core"))
 
 
-def build_kernel(root: Path, folder: Path) -> Path:
-    """Compile the kernel for highway-env into a folder; return the file. Raises as `build` does."""
+def build_kernel(root: Path, folder: Path) -> Compilation:
+    """Begin to compile the kernel for highway-env into a folder. Raises as `build` does."""
     source = root / "crashhunt" / "highway" / "accelerator"
     return _compile(source, "kernel.cpp", "_kernel.py", folder / _module("_crashhunt_highway"))
 
@@ -91,23 +132,17 @@ def _module(name: str) -> str:
     return f"{name}{sysconfig.get_config_var('EXT_SUFFIX')}"
 
 
-def build_link_order(root: Path, folder: Path) -> Path:
-    """Compile the library that fixes the order of SUMO's links into a folder; return the file.
-
-    Raises:
-        ValueError: the system is not Linux.
-        OSError: there is no compiler.
-        subprocess.SubprocessError: it fails.
-    """
+def build_link_order(root: Path, folder: Path) -> Compilation:
+    """Begin to compile the library that fixes the order of SUMO's links into a folder. Raises as `build` does."""
     return _compile(root / "crashhunt" / "native", "link_order.cpp", "_link_order.py", folder / LINK_ORDER)
 
 
-def build_native_stack(root: Path, folder: Path) -> Path:
-    """Compile the library that writes native stacks into a folder; return the file. Raises as `build_link_order`."""
+def build_native_stack(root: Path, folder: Path) -> Compilation:
+    """Begin to compile the library that writes native stacks into a folder. Raises as `build` does."""
     return _compile(root / "crashhunt" / "executors", "native_stack.cpp", "_native_stack.py", folder / NATIVE_STACK)
 
 
-def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
+def _compile(folder: Path, source: str, interface: str, built: Path) -> Compilation:
     if sys.platform != "linux":
         raise ValueError("it is for CPython on Linux")
     compiler = os.environ.get("CXX") or next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
@@ -122,7 +157,4 @@ def _compile(folder: Path, source: str, interface: str, built: Path) -> Path:
     )
     words += [f"-DCRASHHUNT_INTERFACE={match[1]}", f"-Wl,--build-id=0x{build_id}"]
     words += [f"-I{sysconfig.get_path('include')}", str(folder / source)]
-    done = subprocess.run([*words, "-o", str(built), "-ldl"], capture_output=True, text=True, timeout=600, check=False)
-    if done.returncode:
-        raise subprocess.SubprocessError(f"the compiler says: {done.stderr.strip()[-2000:]}")
-    return built
+    return Compilation([*words, "-o", str(built), "-ldl"], built)

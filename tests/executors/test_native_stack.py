@@ -59,7 +59,8 @@ def folder(tmp_path_factory):
         specification = importlib.util.spec_from_file_location("build_core", ROOT / "scripts" / "build_core.py")
         module = importlib.util.module_from_spec(specification)
         specification.loader.exec_module(module)
-        module.build_native_stack(ROOT, folder)
+        with module.build_native_stack(ROOT, folder) as compilation:
+            compilation.finish()
     (folder / "lines.c").write_text(LINES, encoding="utf-8")
     for name, word in (("libdebug.so", "-g"), ("libstripped.so", "-s")):
         words = ["-shared", "-fPIC", "-O0", "-fvisibility=hidden", "-o", name, "lines.c"]
