@@ -482,7 +482,7 @@ def _refuse_without(agent: Agent, method: str, argument: str) -> None:
         what = "is async, so a call does not run it"
     else:
         with suppress(TypeError, ValueError):  # a function in C may have no signature
-            signature = inspect.signature(found)
+            signature = inspect.signature(found, follow_wrapped=False)  # a decorator may add arguments
             try:
                 signature.bind(None)
             except TypeError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sys
@@ -308,6 +309,17 @@ def test_agent_whose_method_would_not_run_does_not_start(tmp_path, method, runs,
     assert (str(result.outcome), result.failure.kind) == ("invalid", "UsageError")  # of every value of the arguments
     assert result.failure.message.startswith(f"its method {method}(")
     assert f") {says}" in result.failure.message
+
+
+def test_a_decorator_may_add_an_argument_to_a_method_of_an_agent(tmp_path):
+    """The signature that functools.wraps copies is that of the inner function, which is not what is called."""
+
+    @functools.wraps(lambda observation, speed: None)
+    def act(observation):
+        return 1.0, 0
+
+    agent = WithoutMethods(reset=lambda seed: None, act=act)
+    assert str(run(tmp_path, agent=agent, steps=2).outcome) == "survived"
 
 
 @pytest.mark.parametrize(
