@@ -198,9 +198,10 @@ class HuntComparer:
             except CrashhuntError as error:
                 return _no_figures(str(error))
 
-        paths, before = tuple(str(view.path) for view in views), self._paths
+        paths = tuple(str(view.path) for view in views)
+        found = self._found([(row["dir"], row["trials_run"]) for row in rows], make, now=paths != self._paths)
         self._paths = paths
-        return self._found([(row["dir"], row["trials_run"]) for row in rows], make, now=paths != before)
+        return found
 
 
 def _no_figures(why: str) -> JsonObject:

@@ -157,6 +157,8 @@ def comparer(monkeypatch):
         made.clock[0] += 2.0
         if "broken" in made.compared[-1]:
             raise CrashhuntError("broken")
+        if "gone" in made.compared[-1]:
+            raise FileNotFoundError
         data = {"hunts": [{"dir": str(path), "n": len(made.compared)} for path in paths]}
         pairs = [SimpleNamespace(verdict=f"{paths[-1]} is better than {paths[0]}", caution="few")]
         return SimpleNamespace(to_json=lambda: data, pairs=pairs)
@@ -192,6 +194,9 @@ def test_comparison_takes_a_twentieth_of_the_time(comparer):
     assert len(comparer.compared) == 2
     comparer.compare([one, three])  # others are compared at once
     assert comparer.compared[2:] == [["one", "three"]]
+    for _ in range(2):  # an error leaves no figures of other hunts
+        with pytest.raises(FileNotFoundError):
+            comparer.compare([one, View("gone")])
 
 
 def test_comparison_that_cannot_be_made_states_its_reason(comparer):
