@@ -348,7 +348,6 @@ _LEGEND_FONT_PIXELS, _LEGEND_ROW_PIXELS, _LEGEND_GAP_PIXELS, _MAX_LEGEND_ROWS = 
 _NAME_ROW_PIXELS = 11  # height of a row of names below bars
 _LARGE_NAME_CHARACTERS = 12  # characters of a name that are written large
 _MAX_DRAWN_VALUE = 1e100  # beyond it, the difference of two numbers may overflow; drawn as missing
-_FINE_ROWS, _FINE_COLUMNS = 120, 180  # of a matrix whose contours are drawn
 
 
 def painted(panel: Panel, width: int, height: int, label: str) -> NDArray[np.uint8]:
@@ -389,7 +388,7 @@ def _paint_heatmap(panel: Heatmap, canvas: Canvas) -> None:
 def _paint_contour(panel: Contour, canvas: Canvas) -> None:
     values, levels = _matrix_of(panel.values), max(1, panel.levels)
     low, high = _limits(values, panel.low, panel.high)
-    fine = _fine(values)
+    fine = _bilinear(values, 120, 180)
     there = np.isfinite(fine)
     share = (np.where(there, fine, low) - low) / span_of(low, high)
     level = np.clip((share * levels).astype(int), 0, levels - 1)
@@ -647,20 +646,22 @@ def _finite_runs(x: NDArray[np.generic], y: NDArray[np.float64]) -> list[NDArray
     return [np.stack((x[a:b], y[a:b]), 1).astype(float) for a, b in zip(edges[0::2], edges[1::2], strict=True)]
 
 
-def _fine(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a matrix with more rows and columns, interpolated bilinearly: along each row, then along each column."""
-    for count in (_FINE_COLUMNS, _FINE_ROWS):
-        known = np.arange(values.shape[1])
-        places = np.linspace(0, values.shape[1] - 1, count)
-        values = np.array([np.interp(places, known, line) for line in values]).T
-    return values
+def _bilinear(values: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
+    row, column = np.linspace(0, values.shape[0] - 1, rows), np.linspace(0, values.shape[1] - 1, columns)
+    top, left = np.floor(row).astype(int), np.floor(column).astype(int)
+    below, right = np.minimum(top + 1, values.shape[0] - 1), np.minimum(left + 1, values.shape[1] - 1)
+    down, along = (row - top)[:, None], (column - left)[None]
+    upper = values[np.ix_(top, left)] * (1 - along) + values[np.ix_(top, right)] * along
+    lower = values[np.ix_(below, left)] * (1 - along) + values[np.ix_(below, right)] * along
+    fine: NDArray[np.float64] = upper * (1 - down) + lower * down
+    return fine
 
 
 def _paste_map(canvas: Canvas, colors: NDArray[np.uint8], *, smooth: bool) -> tuple[int, int, int, int]:
-    """Stretch a picture over the room for it; return the room, in pixels."""
     from PIL import Image
 
     resample = Image.Resampling.BILINEAR if smooth else Image.Resampling.NEAREST
+    """Stretch a picture over the room for it, and say where that is."""
     box = (_RIGHT, _TOP, canvas.width - 52, canvas.height - 8)
     canvas.image.paste(Image.fromarray(colors).resize((box[2] - box[0], box[3] - box[1]), resample), box[:2])
     return box
