@@ -10,7 +10,7 @@ import numpy as np
 
 from crashhunt.base.errors import ActionError, UnusableValueError
 from crashhunt.base.foreign_code import members, supports, truth_of
-from crashhunt.simulators import action_form, native
+from crashhunt.simulators import action_form
 
 _STEP_PARTS = ("observations", "rewards", "terminations", "truncations", "infos")
 _FIX = "return a bool for each agent"
@@ -140,13 +140,13 @@ class OneLearner(gymnasium.Env[Any, Any]):
         if self._policy is None:
             return _random_action(space, self.np_random, mask)
         action = self._policy(str(name), seen, space, self.np_random)
-        if space.contains(action):
-            return action
-        try:
-            return native(form := action_form(space), form.encode(action))
-        except ActionError as error:
-            what = f"gym.others = {self._policy_name!r} returned for {str(name)!r}"
-            raise UnusableValueError(f"{what}: {error.message}", fix=error.fix) from None
+        if not space.contains(action):
+            try:
+                action_form(space).encode(action)  # a check only: the environment receives what the function returned
+            except ActionError as error:
+                what = f"gym.others = {self._policy_name!r} returned for {str(name)!r}"
+                raise UnusableValueError(f"{what}: {error.message}", fix=error.fix) from None
+        return action
 
 
 def _random_action(space: Any, rng: np.random.Generator, mask: Any = None) -> object:

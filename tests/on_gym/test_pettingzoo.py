@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,6 +12,7 @@ from crashhunt.base.foreign_code import ForeignError
 from crashhunt.errors import ScenarioError, UnusableValueError
 from crashhunt.gym import GymSimulator
 from crashhunt.gym._descriptor import CrashRule, GymSetup
+from crashhunt.gym._pettingzoo import OneLearner
 from crashhunt.scenario import AgentSetup, Scenario
 from crashhunt.testing import SimulatorContract
 
@@ -144,6 +147,16 @@ def test_action_of_another_player_outside_its_space_names_the_player(tmp_path):
         f"gym.others = '{__name__}:out_of_range' returned {one} is not in Discrete(3); return an action in this space"
         for one in says
     }
+
+
+def test_action_of_another_player_reaches_the_environment_as_it_was_returned():
+    space = spaces.Box(-1, 1, (1,), np.float32)
+    parallel = SimpleNamespace(
+        possible_agents=["a", "b"], observation_space=lambda _: space, action_space=lambda _: space
+    )
+    made = OneLearner(parallel, policy=lambda *_: np.array([0.1]))
+    made._seen = {"b": np.zeros(1)}
+    assert made._other_actions("b").dtype == np.float64
 
 
 def test_masked_actions_are_not_drawn(tmp_path):
