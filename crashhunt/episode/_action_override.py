@@ -43,6 +43,11 @@ class Overruling:
         self._step = 0
         self._driver.reset(seed)
 
+    def drive(self, observation: object) -> tuple[int, object]:
+        """Let the agent act; return the number of the step and the action of the agent."""
+        step, self._step = self._step, self._step + 1
+        return step, self._driver.act(observation)
+
     def close(self) -> None:
         """Close the agent."""
         if supports(self._driver, Closes):

@@ -99,8 +99,7 @@ class ReferenceCorrection(Overruling):
 
     def act(self, observation: object) -> object:
         """Return the agent's action if it is safe, and otherwise the corrected action."""
-        step, self._step = self._step, self._step + 1
-        action = self._driver.act(observation)
+        step, action = self.drive(observation)
         if step < self._after:
             return action
         encoded = self._form.encode(action)

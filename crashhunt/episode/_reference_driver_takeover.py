@@ -72,8 +72,7 @@ class CompetentDriver(Overruling):
 
     def act(self, observation: object) -> object:
         """Return the agent's action, or the action of the model after it has perceived the risk."""
-        step, self._step = self._step, self._step + 1
-        action = self._driver.act(observation)
+        step, action = self.drive(observation)
         if step < self._after:
             return action
         scene, around = self._simulator.scene(), self._see(self._agent)

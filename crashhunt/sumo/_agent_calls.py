@@ -32,9 +32,7 @@ _CALLERS_OF_AGENTS = {
     "crashhunt.episode._episode": ("step", "_act", "_make"),
     "crashhunt.episode._fast_path": ("resume_after",),
     "crashhunt.episode._parts": ("agent",),
-    "crashhunt.episode._action_override": ("act", "reset", "close"),
-    "crashhunt.episode._reference_driver_correction": ("act",),
-    "crashhunt.episode._reference_driver_takeover": ("act",),
+    "crashhunt.episode._action_override": ("act", "drive", "reset", "close"),
     "crashhunt.episode._failures": ("close_agent",),
 }
 """The functions that call agents, by module."""
