@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
+from crashhunt.recording import AgentChannel, Prologue
 from crashhunt.recording._foxglove import MESSAGES, to_ns
-from crashhunt.recording.records._agent_records import message_of
+from crashhunt.recording.records._agent_records import ArrayForm, message_of
 
 
 @pytest.mark.parametrize(
@@ -17,6 +19,15 @@ from crashhunt.recording.records._agent_records import message_of
 )  # fmt: skip
 def test_arrays_keep_every_bit(dtype, name):
     assert MESSAGES[message_of(dtype)].DESCRIPTOR.full_name == f"crashhunt.{name}"
+
+
+@pytest.mark.parametrize("dtype", ["<f4", "<f8", "<i8", "<u4", "|i1", "|b1"])
+def test_an_array_of_every_type_is_the_same_after_its_message(dtype):
+    prologue = Prologue((AgentChannel("ego", dtype, (3,), dtype, (3,)),), 0.1)
+    payload = np.array([1, 0, 1], dtype).tobytes()
+    name, fields = ArrayForm("observation_dtype").to_message(payload, prologue, 0)
+    message = MESSAGES[name].FromString(MESSAGES[name](**fields).SerializeToString())
+    assert ArrayForm("observation_dtype").to_payload(message, prologue, 0) == payload
 
 
 @pytest.mark.parametrize("dtype", ["<f2", "<f16", "<c8", "<U2", "|O8"])

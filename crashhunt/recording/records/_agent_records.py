@@ -44,7 +44,10 @@ class ArrayForm(Form):
     def to_message(self, payload: bytes, prologue: Prologue, aux: int) -> tuple[str, Fields]:
         """Return the numbers in a message that can represent the array's type without loss."""
         dtype = getattr(prologue.agents[aux], self._what)
-        return message_of(dtype), {"values": np.frombuffer(payload, dtype).tolist()}
+        array = np.frombuffer(payload, dtype)
+        if array.dtype.kind == "b":
+            array = array.view(np.uint8)  # protobuf 7 refuses bools as integers
+        return message_of(dtype), {"values": array.tolist()}
 
     def to_payload(self, message: Message, prologue: Prologue | None, aux: int) -> bytes:
         """Return the array of the message as bytes."""
