@@ -35,9 +35,15 @@ Group = Literal["agents", "backends", "disturbances", "executors", "oracles", "s
 
 def registered(group: Group) -> dict[str, EntryPoint]:
     """Return the entry points of a group, by name, without imports."""
+    return dict(_registered_in(group, tuple((place, _changed_at(place)) for place in sys.path)))
+
+
+@lru_cache(maxsize=64)
+def _registered_in(group: Group, places: tuple[tuple[str, int], ...]) -> dict[str, EntryPoint]:
+    # To load a scenario asks twice, and many packages may be installed.
     found: dict[str, EntryPoint] = {}
     seen: set[str] = set()
-    for distribution in distributions():
+    for distribution in (one for place in places for one in _distributions_in(*place)):
         name, points = _entry_points_of(distribution)
         if name not in seen:  # of two versions, the first is the one that is imported
             seen.add(name)

@@ -166,6 +166,12 @@ def shipped_scenarios() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in shipped_folder().glob(f"*/{SCENARIO}")))
 
 
+def _is_shipped(name: str) -> bool:
+    """Return whether a name is one of `shipped_scenarios`, without a look at the others."""
+    is_name = name == os.path.basename(name) and name not in ("", os.curdir, os.pardir)  # noqa: PTH119
+    return is_name and os.path.isfile(shipped_folder() / name / SCENARIO)  # noqa: PTH113
+
+
 def copy_shipped_scenario(name: str, to: Path) -> None:
     """Copy the files of a scenario that comes with crashhunt into a new folder.
 
@@ -224,14 +230,14 @@ def load_scenario(name: str | Path, *, ego: str = "", kept: bool = False) -> Sce
     if not kept:
         for backend in scenario.backends.values():
             backend.check_names(scenario, ego)
-        if str(name) in shipped_scenarios() and _has_scenario(Path(name)) and not Path(name).samefile(path.parent):
+        if _is_shipped(str(name)) and _has_scenario(Path(name)) and not Path(name).samefile(path.parent):
             note = f"the scenario {name} is the one that comes with crashhunt; --scenario ./{name} is the folder here"
             scenario = replace(scenario, notes=(*scenario.notes, note))
     return scenario
 
 
 def _has_scenario(folder: Path) -> bool:
-    return any(any(folder.glob(f"*{ending}")) for ending in (SCENARIO, *_endings()[1:]))
+    return folder.is_dir() and any(any(folder.glob(f"*{ending}")) for ending in (SCENARIO, *_endings()[1:]))
 
 
 def endings() -> tuple[str, ...]:
@@ -315,7 +321,7 @@ def _keys_of_a_file() -> list[str]:
 def _path_of(name: str | Path) -> Path:
     """Return the path of the scenario file that a name or path refers to."""
     path, text = Path(name), str(name)
-    if text in shipped_scenarios():  # a folder of the same name is ./NAME
+    if _is_shipped(text):  # a folder of the same name is ./NAME
         path = shipped_folder() / text
     if path.is_dir():
         path = path / layout.SCENARIO
