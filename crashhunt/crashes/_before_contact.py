@@ -28,7 +28,7 @@ _BEFORE_S = 1.0  # as long as the first half of a lane change takes
 _ACROSS_M = 50.0  # from the line of a junction to where it ends; there are larger ones
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ApproachPath:
     """The motion of an actor before the contact, with one row for each of the times of an `Approach`."""
 
@@ -39,7 +39,7 @@ class ApproachPath:
     length: float  # length of the actor, in m
     width: float  # width of the actor, in m
 
-    @property
+    @cached_property
     def centers(self) -> NDArray[np.float64]:
         """The centre of the actor's outline, shape (n, 2), in m."""
         return self.points - self.length / 2 * np.stack((np.cos(self.headings), np.sin(self.headings)), axis=1)

@@ -284,12 +284,14 @@ class ContactRecord(Approach):
         shared = None if self._drove_straight(follow.id) else self._shared_paths[follow.id]
         if shared is not None and shared.meets_rear:  # where the road bends tightly, the leader shows the way
             ends.insert(1, self._trail(leader).centers(lead.length))
-        path = np.vstack((follow.centers, *ends))
+        path, places = np.vstack((follow.centers, *ends)), lead.centers
+        legs = np.diff(path, axis=0)
+        squares = np.maximum((legs**2).sum(axis=1), 1e-12)
         behind_m = min(_MAX_ASIDE_M, (lead.width + follow.width) / 2 - _MIN_OVERLAP_M)
         limit_m = max(BESIDE_M, behind_m) + min(_BEND_M, self._bend_m / 2)
         found = 0.0
         for back in range(len(self.times) - 1, -1, -1):
-            if _distance(path[back:], lead.centers[back]) > limit_m:
+            if _distance(path[back:-1], legs[back:], squares[back:], places[back]) > limit_m:
                 break
             found = float(self.times[back])
         return found
@@ -324,16 +326,32 @@ class ContactRecord(Approach):
     def _changed_s(self, actor: str) -> float | None:
         if actor in self.jumpers:
             return 0.0
-        left = self.lanes.left_sideways(self.before, actor)
-        if self.lanes.left_sideways(self.until_contact(actor)[left or 0 :], actor) or self.is_changing(actor):
+        if self._leaves_last(actor) or self.is_changing(actor):
             return float(self.times[-1])
+        left = self._left[actor]
         return None if left is None else self.time_s - self.before[left].time_s
+
+    @cached_property
+    def _left(self) -> dict[str, int | None]:
+        """The index of the last scene before the contact at which each actor left a lane over its side."""
+        return {actor: self.lanes.left_sideways(self.before, actor) for actor in (self.agent, self.other)}
+
+    def _leaves_last(self, actor: str) -> bool:
+        """Return whether an actor left a lane over its side between the last scene before the contact and the next."""
+        scenes = self.until_contact(actor)
+        return len(scenes) > len(self.before) and self.lanes.leaves_sideways(scenes[-2:], actor)
+
+    def _has_left_since(self, actor: str, time_s: float) -> bool:
+        """Return whether an actor left a lane over its side between two scenes from a time on."""
+        left = self._left[actor]
+        begin = len(self.before) if self._leaves_last(actor) else left
+        return begin is not None and self.before[begin - 1].time_s >= time_s
 
     def is_changing(self, actor: str) -> bool:
         """Return whether an actor reached into the next lane at the contact, with its centre still in its own lane."""
-        since = self.lanes.left_sideways(self.before, actor) or 0
+        since = self._left[actor] or 0
         through = self.until_contact(actor)[since:]
-        return not self.lanes.left_sideways(through, actor) and any(
+        return not self._leaves_last(actor) and any(
             self.lanes.reaches_over(scenes, actor) for scenes in (through, self.before[since:])
         )
 
@@ -398,11 +416,11 @@ class ContactRecord(Approach):
 
     def lane_changers(self, within_s: float) -> tuple[str, ...]:
         """Return the actors that changed lanes at the contact, or at most the given time before it."""
-        found = []
-        for actor in (self.agent, self.other):
-            scenes = [scene for scene in self.until_contact(actor) if scene.time_s >= self.time_s - within_s]
-            if actor in self.jumpers or self.lanes.leaves_sideways(scenes, actor):
-                found.append(actor)
+        found = [
+            actor
+            for actor in (self.agent, self.other)
+            if actor in self.jumpers or self._has_left_since(actor, self.time_s - within_s)
+        ]
         if found or self.manner not in ("side swipe", "rear end"):
             return tuple(found)
         for actor in (self.agent, self.other):  # they touched before half a lane had been crossed
@@ -501,7 +519,10 @@ def contact_record(bundle: Bundle, recording: Recording | None = None) -> Contac
     )
 
 
-def _distance(path: NDArray[np.float64], point: NDArray[np.float64]) -> float:
-    start, leg = path[:-1], np.diff(path, axis=0)
-    along = np.clip(np.einsum("ij,ij->i", point - start, leg) / np.maximum((leg**2).sum(axis=1), 1e-12), 0.0, 1.0)
-    return float(np.hypot(*(point - start - along[:, None] * leg).T).min())
+def _distance(
+    starts: NDArray[np.float64], legs: NDArray[np.float64], squares: NDArray[np.float64], point: NDArray[np.float64]
+) -> float:
+    """Return the distance of a point from legs, of which the starts, the vectors and the squared lengths are given."""
+    offsets = point - starts
+    along = np.minimum(np.maximum(np.einsum("ij,ij->i", offsets, legs) / squares, 0.0), 1.0)
+    return float(np.hypot(*(offsets - along[:, None] * legs).T).min())

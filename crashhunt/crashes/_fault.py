@@ -226,8 +226,6 @@ def _rear_end(case: ContactRecord) -> FaultFinding | None:
 
 def _turns_off(case: ContactRecord) -> FaultFinding | None:
     """Blame the follower that drove straight on into a turning vehicle that had been ahead of it for long."""
-    if _rear_end(case) is not None:
-        return None  # it says the same
     for leader in (case.agent, case.other):
         follower = case.partner(leader)
         if case.follower == leader or is_person(leader) or is_person(follower) or case.times[0] < _FOLLOWS_S:
@@ -238,6 +236,8 @@ def _turns_off(case: ContactRecord) -> FaultFinding | None:
         lead = case.way(leader)
         if case.hardest_braking(leader) > _IMPOSSIBLE_BRAKING_MPS2 or float(lead.speeds.min()) < -STANDS_MPS:
             continue
+        if _rear_end(case) is not None:
+            return None  # it says the same
         words = f"{follower} drove straight on into {leader}, which had been ahead of it until {case.ago(left_s)}"
         words += " and was turning"
         return _blaming(case, follower, "rear end", words, "Vienna, article 13 (5); StVO § 4 (1)")

@@ -51,6 +51,7 @@ class _Lane:
         self.points = (right + left) / 2
         self.half_width = float(np.hypot(*(left - right).T).mean()) / 2
         steps = np.diff(self.points, axis=0)
+        self._begins = self.points[:-1]
         self._lengths = np.maximum(np.hypot(*steps.T), 1e-9)
         self._directions = steps / self._lengths[:, None]
         self._starts = np.concatenate(([0.0], np.cumsum(self._lengths)))
@@ -64,10 +65,11 @@ class _Lane:
         return self._low_x <= x <= self._high_x and self._low_y <= y <= self._high_y
 
     def place(self, point: NDArray[np.float64]) -> _Place:
-        offset = point - self.points[:-1]
-        along = np.clip(np.einsum("ij,ij->i", offset, self._directions), 0.0, self._lengths)
+        offset = point - self._begins
+        # `np.clip` and `np.argmin` take several times as long on the few legs of a lane.
+        along = np.minimum(np.maximum(np.einsum("ij,ij->i", offset, self._directions), 0.0), self._lengths)
         away = np.hypot(*(offset - along[:, None] * self._directions).T)
-        nearest = int(np.argmin(away))
+        nearest = int(away.argmin())
         dx, dy = self._directions[nearest]
         aside = float(dx * offset[nearest, 1] - dy * offset[nearest, 0])
         driven = float(self._starts[nearest] + along[nearest])
