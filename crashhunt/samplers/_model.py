@@ -37,34 +37,51 @@ if TYPE_CHECKING:
 # A Gaussian process over arguments and seeds (Rasmussen and Williams 2006, algorithm 2.1).
 
 
-class Process:
-    """The Gaussian process of the scores of given trials, with given parameters.
+class KnownTrials:
+    """What a process of some trials does not compute anew for each of the parameters that are tried.
 
     Args:
         points: trials x arguments; a choice is the index of its value.
         seeds: seeds of the trials.
         scores: scores of the trials; only their order matters.
         categorical: which arguments are choices; two values of a choice have the distance 1.
+    """
+
+    def __init__(
+        self, points: Floats, seeds: NDArray[np.int64], scores: Floats, *, categorical: NDArray[np.bool_]
+    ) -> None:
+        self.points, self.seeds = points, seeds
+        ranks = _ranks(scores)
+        self.target: Floats = (ranks - ranks.mean()) / (float(ranks.std()) or 1.0)
+        self.target_and_one = np.column_stack([self.target, np.ones(len(points))])
+        self.numbers, self.choices = np.flatnonzero(~categorical), np.flatnonzero(categorical)
+        self.plain = points[:, self.numbers]
+        self.diagonal = np.diag_indices(len(points))
+        self.have_same_seed = seeds[:, None] == seeds
+
+
+class Process:
+    """The Gaussian process of the scores of given trials, with given parameters.
+
+    Args:
+        known: the trials.
         scales: factors of the arguments, the reciprocals of length scales.
         noise: the share of the variance of scores that is noise, above 0 and below 1.
         seeded: the share of the remaining variance that is explained only by an equal seed.
     """
 
-    def __init__(
-        self, points: Floats, seeds: NDArray[np.int64], scores: Floats, *, categorical: NDArray[np.bool_],
-        scales: Floats, noise: float, seeded: float,
-    ) -> None:  # fmt: skip
-        self._points, self._seeds = points, seeds
-        self._categorical, self._scales = categorical, scales
+    def __init__(self, known: KnownTrials, *, scales: Floats, noise: float, seeded: float) -> None:
+        self._known, self._target = known, known.target
+        self._scales, self._scaled = scales, known.plain * scales[known.numbers]
+        self._squares = (self._scaled**2).sum(axis=1)
         self._noise, self._seeded = noise / (1.0 - noise), seeded
-        ranks = _ranks(scores)
-        self._target = (ranks - ranks.mean()) / (float(ranks.std()) or 1.0)
-        kernel = self._kernel(points, seeds)
-        kernel[np.diag_indices(len(kernel))] += self._noise
+        points = known.points
+        kernel = self._kernel(points, self._scaled, self._squares, known.have_same_seed)
+        kernel[known.diagonal] += self._noise
         self._lower = np.linalg.cholesky(kernel)
         # The mean is estimated by generalized least squares (section 2.7). The average would be too high, because most
         # trials are near a peak: the model would then expect high scores far from all trials.
-        target, one = self._solved(np.column_stack([self._target, np.ones(len(points))])).T
+        target, one = self._solved(known.target_and_one).T
         self._mean = float(one @ target) / float(one @ one)
         self._half = target - self._mean * one
         self._amplitude = max(float(self._half @ self._half) / len(points), 1e-9)
@@ -80,29 +97,33 @@ class Process:
         by ``ambition`` standard deviations of all scores.
         """
         best = float((self._target if among is None else self._target[among]).max())
-        half = self._solved(self._kernel(points, seeds).T)
+        half = self._solved(self._to(points, seeds).T)
         spread = self._amplitude * np.maximum(1.0 + self._noise - (half**2).sum(axis=0), self._noise)
         worth: Floats = (self._mean + half.T @ self._half - best - ambition) / np.sqrt(spread)
         return worth
 
     def _solved(self, right: Floats) -> Floats:
-        from scipy.linalg import solve_triangular  # takes a fifth of a second to import
+        from scipy.linalg.lapack import dtrtrs  # takes a fifth of a second to import
 
-        solved: Floats = solve_triangular(self._lower, right, lower=True, check_finite=False)
+        # As `scipy.linalg.solve_triangular` does it, the checks of which take longer than the solution.
+        solved: Floats = dtrtrs(self._lower.T, right, lower=0, trans=1)[0]
         return solved
 
-    def _kernel(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
-        numbers = ~self._categorical
-        one, other = (of[:, numbers] * self._scales[numbers] for of in (points, self._points))
-        squared = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2.0 * one @ other.T
+    def _to(self, points: Floats, seeds: NDArray[np.int64]) -> Floats:
+        """Return the kernel between points and the known trials."""
+        scaled = points[:, self._known.numbers] * self._scales[self._known.numbers]
+        return self._kernel(points, scaled, (scaled**2).sum(axis=1), seeds[:, None] == self._known.seeds)
+
+    def _kernel(self, points: Floats, scaled: Floats, squares: Floats, have_same_seed: NDArray[np.bool_]) -> Floats:
+        squared = squares[:, None] + self._squares - 2.0 * scaled @ self._scaled.T
         squared = np.maximum(squared, 0.0)
-        for place in np.flatnonzero(self._categorical):
-            differ = points[:, place, None] != self._points[:, place]
+        for place in self._known.choices:
+            differ = points[:, place, None] != self._known.points[:, place]
             squared += self._scales[place] ** 2 * differ
         far = np.sqrt(5.0 * squared)  # Matérn's kernel with 5/2 (equation 4.17): criticality has edges
         kernel: Floats = (1.0 + far + far**2 / 3.0) * np.exp(-far)
         if self._seeded:
-            kernel *= 1.0 - self._seeded + self._seeded * (seeds[:, None] == self._seeds)
+            kernel *= 1.0 - self._seeded + self._seeded * have_same_seed
         return kernel
 
 
@@ -199,9 +220,10 @@ class Model:
         self._process = None
         if trials:
             self._points = np.array([trial.point for trial in trials])
-            self._values = self._cube.values(self._points)
             self._seeds = np.array([trial.seed for trial in trials])
             self._scores = np.array([trial.score for trial in trials])
+            values = self._cube.values(self._points)
+            self._known = KnownTrials(values, self._seeds, self._scores, categorical=self._cube.categorical)
 
     def propose(
         self, rng: np.random.Generator, excluded: Excluded | None = None, among: NDArray[np.bool_] | None = None
@@ -237,10 +259,7 @@ class Model:
     def _with(self, parameters: _Parameters) -> Process:
         noise, seeded = parameters.shares
         return Process(
-            self._values,
-            self._seeds,
-            self._scores,
-            categorical=self._cube.categorical,
+            self._known,
             scales=2.0**-parameters.lengths / math.sqrt(self._cube.dimensions / 6.0),
             noise=noise,
             seeded=seeded,
@@ -254,10 +273,11 @@ class Model:
 
     def _fit(self) -> None:
         """Compare one parameter with its two neighbours, and keep the value with the greatest likelihood."""
+        greatest = self._fitted().likelihood + self.parameters.log_prior
         for tried in [self.parameters.stepped(self._turn, by) for by in (-1, 1)]:
             process = self._with(tried)
-            if process.likelihood + tried.log_prior > self._fitted().likelihood + self.parameters.log_prior:
-                self.parameters, self._process = tried, process
+            if (likelihood := process.likelihood + tried.log_prior) > greatest:
+                self.parameters, self._process, greatest = tried, process, likelihood
         self._turn += 1
 
     def _candidates(

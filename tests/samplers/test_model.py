@@ -7,7 +7,7 @@ import pytest
 
 from crashhunt.samplers import Cube
 from crashhunt.samplers._learning import ScoredTrial
-from crashhunt.samplers._model import TRIALS, Model, Process, _Parameters, _ranks
+from crashhunt.samplers._model import TRIALS, KnownTrials, Model, Process, _Parameters, _ranks
 from crashhunt.space import Choice, Range
 
 PLANE = Cube({("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)})
@@ -15,10 +15,11 @@ PLANE = Cube({("ego", "x"): Range(0.0, 1.0), ("ego", "y"): Range(0.0, 1.0)})
 
 def process(points, scores, seeds=None, **parameters):
     points = np.array(points, dtype=float)
-    told = {"scales": np.full(points.shape[1], 3.0), "noise": 0.01, "seeded": 0.0}
-    told |= {"categorical": np.zeros(points.shape[1], dtype=bool)} | parameters
+    told = {"scales": np.full(points.shape[1], 3.0), "noise": 0.01, "seeded": 0.0} | parameters
     seeds = np.arange(len(points)) if seeds is None else np.array(seeds)
-    return Process(points, seeds, np.array(scores, dtype=float), **told)
+    categorical = told.pop("categorical", np.zeros(points.shape[1], dtype=bool))
+    known = KnownTrials(points, seeds, np.array(scores, dtype=float), categorical=categorical)
+    return Process(known, **told)
 
 
 def test_what_is_near_a_dangerous_trial_is_worth_more_than_what_is_near_a_harmless_one():
@@ -60,7 +61,7 @@ def test_many_trials_at_a_peak_do_not_raise_what_is_expected_far_away():
 
 def test_kernel_is_that_of_matern_with_five_halves():
     known = process([[0.0]], [0.5], scales=np.ones(1))
-    found = known._kernel(np.array([[0.0], [1.0], [2.0]]), np.full(3, -1))[:, 0]
+    found = known._to(np.array([[0.0], [1.0], [2.0]]), np.full(3, -1))[:, 0]
     assert found == pytest.approx([1.0, 0.523994, 0.138660], abs=1e-6)
 
 
