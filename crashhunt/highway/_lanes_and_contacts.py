@@ -11,7 +11,7 @@ from highway_env.vehicle.objects import Obstacle
 
 from crashhunt.simulators import LanePlace, Standstill
 from crashhunt.trial import ALL_AGENTS
-from crashhunt.world import Contact, Event, Lane, rectangle_gap
+from crashhunt.world import STANDS_MPS, Contact, Event, Lane, rectangle_gap
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -92,10 +92,8 @@ def contact_of(
             collider_speed=float(vehicle.speed),
             victim_speed=math.nan,
         )
-    x, y = (hit.position - vehicle.position).tolist()
     first, second = (agent, vehicle), (actor_of(hit).id, hit)
-    ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading) > 0
-    if not ahead and not isinstance(hit, Obstacle):
+    if not _drives_into(vehicle, hit):
         first, second = second, first
     return Contact(
         collider=first[0],
@@ -105,6 +103,22 @@ def contact_of(
         collider_speed=float(first[1].speed),
         victim_speed=float(second[1].speed),
     )
+
+
+def _drives_into(vehicle: RoadObject, hit: RoadObject) -> bool:
+    """Return whether a vehicle drives into the object that it touches; otherwise the object drives into the vehicle."""
+    if isinstance(hit, Obstacle):
+        return True
+    stands, hit_stands = (abs(float(one.speed)) < STANDS_MPS for one in (vehicle, hit))
+    if stands != hit_stands:
+        return hit_stands  # an actor that stands drives into nothing
+    x, y = (hit.position - vehicle.position).tolist()
+    ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading)
+    closing = vehicle.speed * ahead > 0
+    hit_closing = hit.speed * (x * math.cos(hit.heading) + y * math.sin(hit.heading)) < 0
+    if closing != hit_closing:  # one may reverse
+        return closing
+    return ahead > 0
 
 
 # Vehicles and obstacles that are excluded from an episode.

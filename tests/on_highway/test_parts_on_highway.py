@@ -418,10 +418,10 @@ def test_lanes_have_points_at_most_2_m_apart_where_they_are_curved():
     assert bend.shape[-1] == pytest.approx((10.0 * math.cos(1.0), -10.0 * math.sin(1.0)))
 
 
-def touched(*others, heading=0.0):
+def touched(*others, heading=0.0, speed=10.0):
     """The contact of an agent at the origin with others: x, class, whether crashed, and speed."""
     road = straight()
-    agent = Vehicle(road, [0.0, 0.0], heading, 10.0)
+    agent = Vehicle(road, [0.0, 0.0], heading, speed)
     things = [agent]
     for x, kind, crashed, speed in others:
         things.append(kind(road, [x, 0.0], 0.0, speed))
@@ -443,6 +443,24 @@ def test_contact_is_with_the_nearest_crashed_object():
     alone = touched((6.0, Vehicle, False, 4.0))
     assert (alone.collider, alone.victim, alone.collider_speed) == ("ego", "", 10.0)
     assert math.isnan(alone.victim_speed)
+
+
+@pytest.mark.parametrize(
+    ("x", "speed", "its_speed", "collider"),
+    [
+        (-6.0, -9.0, 0.0, "ego"),  # it reverses into a vehicle that is parked
+        (-6.0, -9.0, 2.0, "o1"),  # both approach, and the other one with its front
+        (-6.0, -9.0, -2.0, "ego"),  # it reverses faster than the other one
+        (-6.0, 0.0, 2.0, "o1"),
+        (6.0, 0.0, -2.0, "o1"),  # the other one reverses into a vehicle that stands
+        (6.0, 0.0, 0.0, "ego"),
+        (6.0, 10.0, -2.0, "ego"),
+    ],
+)
+def test_actor_that_stands_or_moves_away_does_not_drive_into_the_other(x, speed, its_speed, collider):
+    found = touched((x, Vehicle, True, its_speed), speed=speed)
+    assert found.collider == collider
+    assert found.collider_speed == (speed if collider == "ego" else its_speed)
 
 
 @pytest.mark.parametrize(
