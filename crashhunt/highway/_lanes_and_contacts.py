@@ -113,9 +113,9 @@ def _drives_into(vehicle: RoadObject, hit: RoadObject) -> bool:
     if stands != hit_stands:
         return hit_stands  # an actor that stands drives into nothing
     x, y = (hit.position - vehicle.position).tolist()
-    ahead = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading)
-    closing = vehicle.speed * ahead > 0
-    hit_closing = hit.speed * (x * math.cos(hit.heading) + y * math.sin(hit.heading)) < 0
+    ahead: float = x * math.cos(vehicle.heading) + y * math.sin(vehicle.heading)
+    closing = float(vehicle.speed) * ahead > 0
+    hit_closing = float(hit.speed) * (x * math.cos(hit.heading) + y * math.sin(hit.heading)) < 0
     if closing != hit_closing:  # one may reverse
         return closing
     return ahead > 0
