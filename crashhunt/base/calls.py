@@ -109,9 +109,10 @@ def _with_arguments(doc: str, of_shape: str, documents: Iterable[Documented]) ->
 
 
 def _refuse(name: str, signature: inspect.Signature, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
-    known = _keywords(signature)
+    parameters = signature.parameters
     for keyword in kwargs:
-        if keyword not in known:
+        if keyword not in parameters or parameters[keyword].kind not in _BY_KEYWORD:
+            known = dict.fromkeys(one for one, parameter in parameters.items() if parameter.kind in _BY_KEYWORD)
             fix = removed_fix(keyword) or one_of(keyword, known, give="it takes", none="no keywords")
             raise CallError(f"{name}() has no argument {keyword!r}", fix=fix)
     try:
@@ -119,22 +120,28 @@ def _refuse(name: str, signature: inspect.Signature, args: tuple[object, ...], k
     except TypeError as problem:
         raise CallError(f"{name}(): {problem}", fix=f"call {name}{_shown(signature)}") from None
     for argument, value in given.items():
-        parameter = signature.parameters[argument]
+        parameter = parameters[argument]
+        annotation = str(parameter.annotation)
+        if not (heads := _checked_heads(annotation)):
+            continue
         for one in value if parameter.kind is parameter.VAR_POSITIONAL else (value,):
-            if fix := _fix_of(str(parameter.annotation), one):
+            if fix := _fix_of(heads, one, of_texts="[str]" in annotation):
                 raise CallError(f"{name}(): {argument} is {describe_value(one)}", fix=fix)
 
 
-def _fix_of(annotation: str, value: object) -> str:
-    """Return what to give instead of a value that is no path, table, list or object; empty if the value is fine.
+@functools.cache  # hunts make thousands of objects, of the same few annotations
+def _checked_heads(annotation: str) -> tuple[str, ...]:
+    """Return the types that an annotation names; none if the functions check the values themselves.
 
-    The functions check numbers and texts themselves.
+    They do so for numbers and texts.
     """
-    heads = re.sub(r"\[.*?\]", "", annotation).split(" | ")
-    if not set(heads) <= _FIXES.keys() or heads in _UNCHECKED:
-        return ""
+    heads = tuple(re.sub(r"\[.*?\]", "", annotation).split(" | "))
+    return heads if set(heads) <= _FIXES.keys() and heads not in _UNCHECKED else ()
+
+
+def _fix_of(heads: tuple[str, ...], value: object, *, of_texts: bool) -> str:
+    """Return what to give instead of a value that is no path, table, list or object; empty if the value is fine."""
     if heads[0] == "Sequence":
-        of_texts = "[str]" in annotation
         is_fine = (
             isinstance(value, Collection)
             and not isinstance(value, str | bytes)
@@ -148,7 +155,8 @@ def _fix_of(annotation: str, value: object) -> str:
     return _FIXES["str" if heads[0] == "Path" and "str" in heads else heads[0]]
 
 
-_UNCHECKED: Final = (["str"], ["str", "None"], ["Bundle"])
+_BY_KEYWORD: Final = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+_UNCHECKED: Final = (("str",), ("str", "None"), ("Bundle",))
 _KINDS: Final[Mapping[str, Any]] = {"Mapping": Mapping, "Path": os.PathLike, "str": str}
 _FIXES: Final = {
     "Bundle": "give the path of a hunt or a crash, or a crash of a hunt that crashhunt.load returned",
@@ -159,11 +167,6 @@ _FIXES: Final = {
     "SnapshotOptions": "give crashhunt.snapshots.SnapshotOptions(…)",
     "str": "give a path",
 }
-
-
-def _keywords(signature: inspect.Signature) -> dict[str, None]:
-    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    return dict.fromkeys(name for name, parameter in signature.parameters.items() if parameter.kind in kinds)
 
 
 def _shown(signature: inspect.Signature) -> str:
