@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 
@@ -23,19 +23,29 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT = Path(crashhunt.__file__).parent
+Node = TypeVar("Node", bound=ast.AST)
 
 
-@functools.cache  # several rules read every file
-def nodes_of(file: Path) -> list[ast.AST]:
-    """All of what a file says."""
-    return list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+@functools.cache  # several rules read every file, and each is about few kinds of its half a million nodes
+def kinds_of(file: Path) -> dict[type[ast.AST], list[Any]]:
+    """All of what a file says, by kind."""
+    kinds: dict[type[ast.AST], list[Any]] = {}
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        kinds.setdefault(type(node), []).append(node)
+    return kinds
+
+
+def nodes_of(file: Path, kind: type[Node]) -> list[Node]:
+    """What of one kind a file says."""
+    return kinds_of(file).get(kind, [])
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget() -> Iterator[None]:
     gc.disable()  # half a million nodes that all stay: to look through them again and again doubles the time
     yield
-    nodes_of.cache_clear()
+    kinds_of.cache_clear()
+    names_simulator.cache_clear()
     gc.enable()
 
 
@@ -43,8 +53,8 @@ def private_imports(file: Path) -> list[str]:
     """The private modules and names that a file imports from outside its own package."""
     package = file.relative_to(ROOT).parts[0]
     found = []
-    for node in nodes_of(file):
-        if not isinstance(node, ast.ImportFrom) or node.module is None or not node.module.startswith("crashhunt."):
+    for node in nodes_of(file, ast.ImportFrom):
+        if node.module is None or not node.module.startswith("crashhunt."):
             continue
         _, *parts = node.module.split(".")
         names = [alias.name for alias in node.names if alias.name.startswith("_") and not alias.name.startswith("__")]
@@ -66,8 +76,8 @@ _OTHERS = ("recording/_foxglove.py", "agents/_policies.py", "highway/")
 def asked_by_name(file: Path) -> list[str]:
     """Where a file asks whether something has an attribute, by a name that no type checker sees."""
     found = []
-    for node in nodes_of(file):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name) or len(node.args) < 2:
+    for node in nodes_of(file, ast.Call):
+        if not isinstance(node.func, ast.Name) or len(node.args) < 2:
             continue
         name = node.args[1].value if isinstance(node.args[1], ast.Constant) else None
         if node.func.id in ("getattr", "hasattr") and isinstance(name, str) and not name.startswith("__"):
@@ -105,15 +115,21 @@ NAMED_ALL_THE_SAME = {
 
 def simulators_named(file: Path) -> list[str]:
     """The simulators that the code of a file names; what is there for people to read is not code."""
-    tree = nodes_of(file)
-    prose = {id(node.value) for node in tree if isinstance(node, ast.Expr)}
+    prose = {id(node.value) for node in nodes_of(file, ast.Expr)}
     found = []
-    for node in tree:
-        if id(node) in prose:
-            continue
-        said = [value for _, value in ast.iter_fields(node) if isinstance(value, str)]
-        found += [f"{node.lineno}: {text}" for text in said if SIMULATORS.search(text)]
-    return found
+    for kind, nodes in kinds_of(file).items():
+        said = [(node, getattr(node, field, None)) for field in kind._fields for node in nodes]
+        found += [
+            (node.lineno, text)
+            for node, text in said
+            if isinstance(text, str) and names_simulator(text) and id(node) not in prose
+        ]
+    return [f"{line}: {text}" for line, text in sorted(found)]
+
+
+@functools.cache  # few words are said again and again
+def names_simulator(text: str) -> bool:
+    return SIMULATORS.search(text) is not None
 
 
 def test_simulators_are_named_in_their_own_homes_only():
@@ -161,10 +177,9 @@ def test_test_files_have_names_of_their_own():
 
 def uses_of_any(file: Path) -> int:
     """How often a file says `Any`: wherever it is imported, in annotations, and in those that are text."""
-    nodes = nodes_of(file)
-    named = sum(isinstance(node, ast.Name) and node.id == "Any" for node in nodes)
-    imported = sum(isinstance(node, ast.alias) and node.name == "Any" for node in nodes)
-    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    named = sum(node.id == "Any" for node in nodes_of(file, ast.Name))
+    imported = sum(node.name == "Any" for node in nodes_of(file, ast.alias))
+    texts = [node.value for node in nodes_of(file, ast.Constant) if isinstance(node.value, str)]
     return (
         named + imported + sum(len(re.findall(r"\bAny\b", text)) for text in texts if re.search(r"\[.*\bAny\b", text))
     )
@@ -204,8 +219,8 @@ def names_behind_doors() -> dict[tuple[str, str], tuple[str, str]]:
     found = {}
     for door in ROOT.rglob("__init__.py"):
         package = ".".join(("crashhunt", *door.parent.relative_to(ROOT).parts))
-        for node in nodes_of(door):
-            if isinstance(node, ast.ImportFrom) and node.level:
+        for node in nodes_of(door, ast.ImportFrom):
+            if node.level:
                 for alias in node.names:
                     found[package, alias.name] = (f"{package}.{node.module}", alias.name)
     return found
@@ -217,8 +232,8 @@ def imports_of_modules() -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for name, file in known.items():
         graph[name] = set()
-        for node in nodes_of(file):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("crashhunt"):
+        for node in nodes_of(file, ast.ImportFrom):
+            if (node.module or "").startswith("crashhunt"):
                 for alias in node.names:
                     place = (str(node.module), alias.name)
                     while place in doors:
@@ -239,7 +254,7 @@ def test_no_modules_import_each_other_in_a_circle():
 
 def test_objects_with_many_fields_are_made_by_keywords():
     """A fourth positional argument is where a reader, and a swap of two fields, goes astray."""
-    made = [node for file in files_of_crashhunt() for node in nodes_of(file) if isinstance(node, ast.ClassDef)]
+    made = [node for file in files_of_crashhunt() for node in nodes_of(file, ast.ClassDef)]
     classes = {node.name for node in made if is_dataclass(node)} - {
         node.name for node in made if not is_dataclass(node)
     }
@@ -247,9 +262,8 @@ def test_objects_with_many_fields_are_made_by_keywords():
     found = [
         f"{file.relative_to(ROOT)}:{node.lineno}"
         for file in files_of_crashhunt()
-        for node in nodes_of(file)
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
+        for node in nodes_of(file, ast.Call)
+        if isinstance(node.func, ast.Name)
         and node.func.id in classes
         and len(node.args) > 3
         and not any(isinstance(argument, ast.Starred) for argument in node.args)
@@ -274,7 +288,7 @@ def test_a_file_name_stands_once():
 def test_a_public_class_name_stands_once():
     """But for the same role in two adapters of simulators, and for the types of what the compiled core returns."""
     files = [file for file in ROOT.rglob("*.py") if file.relative_to(ROOT).parts[0] not in ("highway", "native")]
-    classes = Counter(node.name for file in files for node in nodes_of(file) if isinstance(node, ast.ClassDef))
+    classes = Counter(node.name for file in files for node in nodes_of(file, ast.ClassDef))
     assert [name for name, count in classes.items() if count > 1 and name[0] != "_"] == []
 
 

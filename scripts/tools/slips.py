@@ -6,6 +6,7 @@ import ast
 import difflib
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
@@ -67,12 +68,18 @@ class Slip:
 
         A diff of elements that are swapped on neighbouring lines may remove any of these lines.
         """
-        return source.splitlines()[self.line - 1 : source.count("\n", 0, self.end) + 1]
+        return lines_of(source)[self.line - 1 : source.count("\n", 0, self.end) + 1]
 
     def diff(self, source: str) -> str:
         """Return the lines before and after, as a diff without its head."""
         lines = difflib.unified_diff(source.splitlines(), self.apply(source).splitlines(), n=0, lineterm="")
         return "\n".join(line for line in list(lines)[2:] if not line.startswith("@@"))
+
+
+@lru_cache(maxsize=1)  # each of hundreds of slips of a module asks for them
+def lines_of(source: str) -> list[str]:
+    """Return the lines of a module."""
+    return source.splitlines()
 
 
 def find_slips(source: str) -> list[Slip]:
@@ -328,8 +335,9 @@ class _Finder(ast.NodeVisitor):
         return self._at(node.lineno, node.col_offset), self._at(node.end_lineno, node.end_col_offset)
 
     def _at(self, line: int | None, column: int | None) -> int:
-        text = self._lines[(line or 1) - 1].encode()[: column or 0]  # columns are counted in bytes
-        return self._starts[(line or 1) - 1] + len(text.decode())
+        text, start = self._lines[(line or 1) - 1], self._starts[(line or 1) - 1]
+        # Columns are counted in bytes.
+        return start + (column or 0 if text.isascii() else len(text.encode()[: column or 0].decode()))
 
 
 def _is_chain(node: ast.expr) -> bool:
