@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from crashhunt.hunts import _hunt
+from crashhunt.snapshots import _take
 from crashhunt.trial import Outcome, TrialResult
 
 
@@ -61,6 +62,15 @@ def replace_bundles(monkeypatch):
     monkeypatch.setattr(_hunt, "Recording", lambda records: None)
     monkeypatch.setattr(_hunt.TrialReruns, "confirm", lambda again, crashes: list(crashes))
     return written
+
+
+def leave_own_code_out(monkeypatch):
+    """Leave crashhunt itself out of snapshots: hundreds of files, which take longer than a hunt on made-up results.
+
+    A developer may also change them while tests run.
+    """
+    take = _take._take_module
+    monkeypatch.setattr(_take, "_take_module", lambda name, *words: None if name == "crashhunt" else take(name, *words))
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from made_up_trials import Inline, survives
+from made_up_trials import Inline, leave_own_code_out, survives
 
 import crashhunt
 from crashhunt.errors import CallError, CrashhuntError, HuntDirectoryError, ScenarioError
@@ -45,6 +45,7 @@ def run(tmp_path, monkeypatch):
     """Returns a function that runs a hunt of the given length on made-up results."""
     (tmp_path / "toy.toml").write_text(TOY)
     monkeypatch.chdir(tmp_path)
+    leave_own_code_out(monkeypatch)
 
     def hunt(trials, ends=survives, *, parallel=2, **options):
         def make(name, settings, *, parallel):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from made_up_trials import leave_own_code_out
 from test_hunt_loop import TOY as RANGED
 
 import crashhunt
@@ -39,6 +40,7 @@ OPTIONS = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False, "rare": Tr
 def _folder(tmp_path, monkeypatch):
     (tmp_path / "toy.toml").write_text(TOY)
     monkeypatch.chdir(tmp_path)
+    leave_own_code_out(monkeypatch)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 
 import pytest
+from made_up_trials import leave_own_code_out
 from test_hunt_loop import TOY
 
 import crashhunt
@@ -28,6 +29,7 @@ OPTIONS = {"scenario": "toy.toml", "seed": 4, "snapshot_code": False}
 def _folder(tmp_path, monkeypatch):
     (tmp_path / "toy.toml").write_text(TOY)
     monkeypatch.chdir(tmp_path)
+    leave_own_code_out(monkeypatch)
 
 
 def rows(hunt):
@@ -39,11 +41,11 @@ def rows(hunt):
 def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     hunt, seen = tmp_path / "h", []
     options = OPTIONS | {"keep_going": True, "near_misses": 2, "audit": 1.0, "keep": 1}
-    report = crashhunt.run(hunt, 2, 6, 60, watch=seen.append, **options)
+    report = crashhunt.run(hunt, 2, 5, 60, watch=seen.append, **options)
     found = rows(hunt)
     crashed = [number for number, (outcome, _) in found.items() if outcome == "collision"]
     fine = [number for number in found if number not in crashed]
-    assert sorted(found) == list(range(6))
+    assert sorted(found) == list(range(5))
     assert len(crashed) >= 2
     assert len(fine) >= 2
     assert (report.stopped_because, report.directory) == ("all_trials", hunt)
@@ -68,11 +70,11 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     audits = [status.progress for status in seen if status.phase == "auditing"]  # none if the last trial has left none
     assert all(one.total <= len(fine) for one in audits)
     assert not audits or audits[0].done == 0 < audits[-1].done == audits[-1].total
-    assert (seen[-1].done, seen[-1].planned, seen[-1].crashes) == (6, 6, len(crashed))
+    assert (seen[-1].done, seen[-1].planned, seen[-1].crashes) == (5, 5, len(crashed))
     data = report.to_json()
     assert data["crashes_found"] == len(crashed) > len(list_bundles(hunt))
     assert json.loads(json.dumps(data)) == data
-    assert data["trials_run"] == data["trials_planned"] == 6
+    assert data["trials_run"] == data["trials_planned"] == 5
     assert [one["id"] for one in data["crashes"]] == [kept.id]
     assert len(data["near_misses"]) == 2
     assert data["audit"] == {"trials": len(fine), "not_finished": 0, "differences": []}
@@ -82,21 +84,21 @@ def test_a_hunt_records_confirms_audits_and_keeps_near_misses(tmp_path):
     assert not (hunt / "trials").exists()  # nothing is kept of what was audited
 
     # The same command runs nothing again; more trials are added to those that are there.
-    again = crashhunt.run(hunt, 2, 6, 60, **options)
+    again = crashhunt.run(hunt, 2, 5, 60, **options)
     assert (again.outcomes, again.steps_total) == (report.outcomes, report.steps_total)
     assert "replanned" not in facts_of(hunt)
-    more = crashhunt.run(hunt, 1, 7, 60, **options)
+    more = crashhunt.run(hunt, 1, 6, 60, **options)
     assert facts_of(hunt)["replanned"] is True  # which forbids a p-value
-    assert sum(more.outcomes.values()) == 7
-    assert {number: rows(hunt)[number] for number in range(6)} == found
+    assert sum(more.outcomes.values()) == 6
+    assert {number: rows(hunt)[number] for number in range(5)} == found
     state, (rate,) = hunt_state(hunt), measure_rates(hunt, per="trial")
     assert state.rate["certain"] == rate.to_json()["certain"]  # over all trials, also those of earlier runs
-    assert (state.rate["trials"], state.rate["crashes"]) == (7, state.crashes)
+    assert (state.rate["trials"], state.rate["crashes"]) == (6, state.crashes)
     fewer = crashhunt.run(hunt, 1, 4, 60, **options)
-    assert (sum(fewer.outcomes.values()), hunt_state(hunt).trials_planned) == (7, 4)
+    assert (sum(fewer.outcomes.values()), hunt_state(hunt).trials_planned) == (6, 4)
     for other in ({"seed": 5}, {"sampler": "sobol"}):
         with pytest.raises((HuntDirectoryError, UsageError)):
-            crashhunt.run(hunt, 2, 6, 60, **options | other)
+            crashhunt.run(hunt, 2, 5, 60, **options | other)
     anew = crashhunt.run(hunt, 2, 1, 60, overwrite=True, **OPTIONS)
     assert sum(anew.outcomes.values()) == 1
     assert rows(hunt) == {0: found[0]}

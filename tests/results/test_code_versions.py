@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 
 import pytest
-from made_up_trials import Inline, replace_bundles, survives
+from made_up_trials import Inline, leave_own_code_out, replace_bundles, survives
 
 import crashhunt
 from crashhunt.cli import main
@@ -20,7 +20,6 @@ from crashhunt.ledger import Ledger
 from crashhunt.report import describe_hunt, describe_rates
 from crashhunt.results import CodeVersions, HuntResults, count_versions, crashes_by_version, find_crashes, hunt_state
 from crashhunt.samplers import NamedSampler
-from crashhunt.snapshots import _take
 from crashhunt.statistics import compare, measure_rates
 from crashhunt.trial import Failure, Outcome
 
@@ -47,17 +46,13 @@ REFUSED = "the code has changed since the"
 
 @pytest.fixture
 def agent(tmp_path, monkeypatch):
-    """Writes the agent, which fails in trials whose seeds, modulo 4, are given.
-
-    The files of crashhunt itself do not count, because a developer may change them while these tests run.
-    """
+    """Writes the agent, which fails in trials whose seeds, modulo 4, are given."""
 
     def write(*fails):
         (tmp_path / "mine.py").write_text(AGENT.format(set(fails) or "()"))
         write.fails = fails
 
-    take = _take._take_module
-    monkeypatch.setattr(_take, "_take_module", lambda name, *words: None if name == "crashhunt" else take(name, *words))
+    leave_own_code_out(monkeypatch)
     (tmp_path / "toy.toml").write_text(TOY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
