@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import examples
 
 from crashhunt.crashes import Bundle
 from crashhunt.crashes._contact_record import ContactRecord
@@ -148,13 +149,13 @@ def straight(speed, at=0.0, y=0.0, *, before=None, since=0.0):
     return lambda t: (at - speed * t, y if before is None or t <= since else before, 0.0, speed)
 
 
-ANGLES = (0.7, 2.2, -2.6)
+ANGLES = (-2.6, 0.7, 2.2)
 
 
 def verdict(case):
-    """The verdict, which must be the same wherever the road leads."""
+    """The verdict, which must be the same wherever the road leads; by day it leads elsewhere once."""
     found = fault_in(case).verdict
-    assert [fault_in(rotated(case, angle)).verdict for angle in ANGLES] == [found] * len(ANGLES)
+    assert {fault_in(rotated(case, angle)).verdict for angle in ANGLES[: examples(3)]} == {found}
     return found
 
 

@@ -47,11 +47,11 @@ def _portfolio_told(*trials):
     return made
 
 
-def proposals(made, first, many=100):
+def proposals(made, first, many=40):
     return [made.propose(place, np.random.default_rng(place)) for place in range(first, first + many)]
 
 
-def share_of_the_model(made, first, many=100):
+def share_of_the_model(made, first, many=60):
     return sum(draft.origin == "model" for draft in proposals(made, first, many)) / many
 
 

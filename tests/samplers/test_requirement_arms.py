@@ -18,7 +18,7 @@ FACTS = HuntFacts(1, (VIOLATED,))
 
 
 def violations(conjuncts_of, trials, seed=1, slack_of=lambda x: None):
-    """Hunt on, and return the number of the first trial that violates each requirement."""
+    """Hunt until all requirements are violated, and return the number of the first trial that violates each."""
     sampler, found = GuidedSampler(SPACE, hunt=FACTS), {}
     for number in range(trials):
         proposal = ask(sampler, number, seed)
@@ -34,6 +34,8 @@ def violations(conjuncts_of, trials, seed=1, slack_of=lambda x: None):
         )  # fmt: skip
         if violated:
             found.setdefault(violated, number)
+            if len(found) == len(rows):
+                break
         sampler.tell(result)
     return found
 

@@ -8,6 +8,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
+from conftest import examples
 from hypothesis import given, strategies as st
 
 from crashhunt.statistics import Bets, Interval, RateTest
@@ -104,8 +105,8 @@ def test_no_rate_beyond_an_end_has_less_evidence(units):
     test = RateTest(Bets(1.0, 1.0, fixed_exposure=False))
     test.extend(units * 20)
     low, high = test.interval()
-    beyond = [high * factor for factor in np.geomspace(1.0001, 1e5, 200)]
-    beyond += [low / factor for factor in np.geomspace(1.0001, 1e5, 200) if low > 0]
+    factors = np.geomspace(1.0001, 1e5, examples(200))
+    beyond = [high * factor for factor in factors] + [low / factor for factor in factors if low > 0]
     mixture = [test.bets.log_mixture(test.log_capitals(rate)) for rate in beyond]
     assert min(map(test.log_evidence, beyond)) >= math.log(20)
     assert min(mixture) >= math.log(20)
@@ -116,7 +117,7 @@ def test_each_component_falls_and_then_rises_in_the_rate():
 
     n r³ + r² (c - q n) + r q (n - 2 c) - c q (1 - q) has one root above 0 for all shares of crashes and all q.
     """
-    for share, q in product(np.linspace(0.005, 1, 200), np.geomspace(1e-7, 0.98, 60)):
+    for share, q in product(np.linspace(0.005, 1, examples(200)), np.geomspace(1e-7, 0.98, examples(60))):
         roots = np.roots([1.0, share - q, q * (1 - 2 * share), -share * q * (1 - q)])
         above = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-15)]
         assert len(above) == 1, (share, q)
@@ -240,13 +241,13 @@ def test_the_true_rate_is_ever_outside_in_at_most_5_5_percent_of_2000_runs(rate)
 def test_the_interval_of_exposures_covers_the_true_rate():
     """Crashes end trials early, so exposure and crash depend on each other, as they do in real trials."""
     rng, hazard, longest, outside = np.random.default_rng(5), 0.02, 10.0, 0
-    for _ in range(60):
+    for _ in range(examples(60)):
         ends = rng.exponential(1 / hazard, 400)
         test = RateTest(Bets(1.0, longest, fixed_exposure=False))
         test.extend((float(end < longest), min(end, longest)) for end in ends)
         low, high = test.interval()
         outside += not low <= hazard <= high
-    assert outside <= 4
+    assert outside <= examples(60) / 15  # a twentieth on average at most
 
 
 def test_clusters_count_as_one_unit():
@@ -274,7 +275,7 @@ def test_many_different_exposures_are_spread_and_never_make_the_interval_narrowe
     assert len(spread._units) <= 2 * 257
     assert sum(count for _, count in spread._units.items()) == pytest.approx(1500)
     assert sum(over * count for (_, over), count in spread._units.items()) == pytest.approx(sum(exposures))
-    for rate in np.geomspace(1e-3, 10, 60):
+    for rate in np.geomspace(1e-3, 10, examples(60)):
         assert (spread.log_capitals(rate) <= exact.log_capitals(rate) + 1e-9).all()
     assert spread.interval() == pytest.approx(exact.interval(), rel=1e-3)
     at_once = deepcopy(spread)

@@ -249,7 +249,7 @@ def test_many_invalid_trials_end_a_hunt_undecided_and_few_do_not():
 
 
 def test_share_of_invalid_trials_just_above_the_limit_ends_a_hunt_too():
-    outcomes = (["survived"] * 9 + ["invalid"] + ["survived"] * 9) * 400  # 5.26 %
+    outcomes = (["survived"] * 9 + ["invalid"] + ["survived"] * 9) * 220  # 5.26 %
     watch = watched(outcomes, bar=1e-5)
     assert watch.decided_at is not None
     assert watch.why_undecided == "too many trials are invalid, so more of them do not help"

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import examples
 
 from crashhunt.statistics import CountingRule, Interval, RateTest, TrialFacts
 from crashhunt.statistics._paired_rates import difference_of_rates
@@ -36,8 +37,9 @@ def drawn(rng, number, hazards, shared, speeds=(10.0, 10.0)):
 def test_interval_seldom_ever_excludes_the_true_difference_and_decides_what_the_rates_alone_do_not():
     rng = np.random.default_rng(26)
     outside = decided = decided_by_rates = 0
+    repetitions = examples(8)
     for hazards in ((0.003, 0.003), (0.001, 0.006)):
-        for _ in range(8):
+        for _ in range(repetitions):
             pairs = drawn(rng, 200, hazards, 0.5)
             for looked in (50, 200):
                 found = difference_of_rates(pairs[:looked], (RULE, RULE), "hour")
@@ -49,8 +51,8 @@ def test_interval_seldom_ever_excludes_the_true_difference_and_decides_what_the_
             first, second = (test.interval(0.025) for test in tests)
             decided += found.low > 0
             decided_by_rates += second.low > first.high
-    assert outside <= 3
-    assert decided >= 6
+    assert outside <= repetitions * 3 / 8
+    assert decided >= repetitions * 6 / 8
     assert decided > 2 * decided_by_rates
 
 
