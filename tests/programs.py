@@ -29,9 +29,12 @@ class Driver:
         return (0.0 if ahead and min(ahead) < 12.0 else self.speed), 0
 """
 
+# The first line of a program in Python that needs no packages. What PATH has as `python3` may be a script, as that of
+# pyenv is, which takes several times as long as the program; and a path with a space cannot follow "#!".
+PYTHON = "#!/usr/bin/env python3\n" if " " in sys.executable else f"#!{sys.executable} -S\n"
+
 # The words of the command line: the harm, and the message at which it is done; none for a driver without harm.
 PROGRAM = """\
-#!/usr/bin/env python3
 import json, os, signal, subprocess, sys, time
 
 kind, when = [*sys.argv[1:], "", ""][:2]
@@ -181,7 +184,7 @@ int main(void) {
 def write_program(folder: Path, name: str = "planner") -> Path:
     """Write the program in Python into a folder, and return its path."""
     path = folder / name
-    path.write_text(PROGRAM, encoding="utf-8")
+    path.write_text(f"{PYTHON}{PROGRAM}", encoding="utf-8")
     path.chmod(0o755)
     return path
 

@@ -16,7 +16,7 @@ import pytest
 from conftest import mostly_nightly
 from gymnasium import spaces
 from json_schemas import validator
-from programs import COMPILER, compile_program, write_binary_program, write_program
+from programs import COMPILER, PYTHON, compile_program, write_binary_program, write_program
 from simulated import Simulated, answers_in_python, observations
 
 import crashhunt
@@ -521,12 +521,11 @@ def test_the_first_hello_has_the_chosen_parts_and_ready_may_choose_them(tmp_path
     assert asked.agents["ego"].arguments["observed"].spec == "actors,ego"
 
 
-CHOOSES = """\
-#!/usr/bin/env python3
+CHOOSES = f"""{PYTHON}\
 import json
 parts = json.loads(input())["observation"]
-observed = {"default": ",".join(sorted(parts))}
-print(json.dumps({"type": "ready", "observation": ["ego"], "arguments": {"observed": observed}}))
+observed = {{"default": ",".join(sorted(parts))}}
+print(json.dumps({{"type": "ready", "observation": ["ego"], "arguments": {{"observed": observed}}}}))
 """
 
 

@@ -181,7 +181,7 @@ def stubbed(folder, *crashes, **inputs):
     stub.write_text(STUB)
     stub.chmod(0o755)
     runner.environment |= {
-        "PATH": f"{stub.parent}{os.pathsep}{os.environ['PATH']}",
+        "PATH": f"{stub.parent}{os.pathsep}{runner.environment['PATH']}",
         "FOUND_BY_STUB": json.dumps(crashes),
     }
     for crash in crashes:
@@ -297,7 +297,7 @@ def test_gate_fails_where_the_change_is_worse_or_cannot_be_compared(tmp_path, ve
     stub = tmp_path / "bin" / "crashhunt"
     stub.write_text(GATE_STUB)
     stub.chmod(0o755)
-    path = f"{stub.parent}{os.pathsep}{os.environ['PATH']}"
+    path = f"{stub.parent}{os.pathsep}{runner.environment['PATH']}"
     runner.environment |= {"PATH": path, "VERDICT": verdict, "CODE": str(code)}
     told = runner.run()
     assert runner.failed == fails, runner.said
