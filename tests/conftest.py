@@ -581,7 +581,7 @@ def toy(shell: Shell) -> Shell:
 
 def keeps_going(toy: Shell) -> None:
     """Hunt 12 trials of it, of which some crash, in ``h``; for `made_once`."""
-    toy.crashhunt("run", "h", "2", "12", "99", "--scenario", "toy", "--seed", "5", "--keep-going")
+    toy.crashhunt("run", "h", "2", "12", "99", "--scenario", "toy", "--seed", "5", "--keep-going", "--no-snapshot")
 
 
 def crashes_on_loop(shell: Shell) -> None:

@@ -21,7 +21,7 @@ from crashhunt.base.integrity import digest_of_data
 from crashhunt.cli import main
 from crashhunt.errors import HuntDirectoryError
 
-HUNT = ("1", "8", "99", "--scenario", "toy", "--arg", "speed=4:14", "--set", "gap_m=20:30", "--seed", "4")
+HUNT = ("1", "5", "99", "--scenario", "toy", "--arg", "speed=11:14", "--set", "gap_m=20:30", "--seed", "4")
 
 
 def hunted(shell):
@@ -182,14 +182,14 @@ def test_a_snapshot_that_has_more_or_other_files_is_refused(hunt, crash):
 def test_a_snapshot_that_is_damaged_is_made_again(hunt, toy):
     (snapshot,) = (hunt / "snapshots").iterdir()
     (snapshot / "code" / "crashhunt" / "episode" / "_episode.py").write_text("")
-    toy.crashhunt("run", "h", "1", "9", *HUNT[2:], "--keep-going", "--keep-trials", "--keep", "2")
+    toy.crashhunt("run", "h", "1", "6", *HUNT[2:], "--keep-going", "--keep-trials", "--keep", "2")
     assert command("check", "h")[0] == 0
 
 
 def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     whole = command("check", "h", "--json")
     found = json.loads(whole[1])
-    assert (whole[0], found["fine"], found["hunts"][0]["trials"]) == (0, True, 8)
+    assert (whole[0], found["fine"], found["hunts"][0]["trials"]) == (0, True, 5)
     first, second, *_ = sorted((hunt / "crashes").iterdir())
     (first / "log.mcap").write_bytes(b"")
     (hunt / "crashes" / ".000099-hang.part").mkdir()
@@ -204,7 +204,7 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
         "trials 3", f"the crash {first.name}"
     }  # fmt: skip
     assert any(".000099-hang.part" in finding["where"] for finding in state["findings"] if not finding["damaged"])
-    assert found["salvaged"] == {"trials": 6, "crashes": len(list((hunt / "crashes").glob("[!.]*"))) - 1}
+    assert found["salvaged"] == {"trials": 3, "crashes": len(list((hunt / "crashes").glob("[!.]*"))) - 1}
     assert not any(
         finding["damaged"] for finding in json.loads(command("check", "saved", "--json")[1])["hunts"][0]["findings"]
     )
@@ -216,7 +216,7 @@ def test_check_states_what_is_lost_and_saves_the_rest(hunt, crash, toy):
     trials = [
         {name: row[name] for name in columns} for row in json.loads(command("trials", "saved", "--format", "json")[1])
     ]
-    assert [row["number"] for row in trials] == list(range(8))
+    assert [row["number"] for row in trials] == list(range(5))
     assert (hunt.with_name("saved") / "crashes" / first.name / "log.mcap").stat().st_size
     assert command("check", "saved")[0] == 0
     assert "the directory exists already" in command("check", "before", "--salvage", "saved")[2]

@@ -51,7 +51,7 @@ def test_a_program_that_fails_at_once_is_an_error_of_the_agent_and_one_that_is_m
     program = toy.folder / "fails"
     program.write_text("#!/bin/sh\necho 'no planner.yaml' >&2\nexit 4\n")
     program.chmod(0o755)
-    done = toy.crashhunt("run", "h", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--json")
+    done = toy.crashhunt("run", "h", "1", "1", "20", "--agent", "exec:./fails", *RUN, "--no-snapshot", "--json")
     assert done.json["outcomes"] == {"agent_error": 1}
     failed = "the program exited with 4 instead of answering hello"
     assert f"exec:./fails has not declared its arguments: {failed} (its last output: no planner.yaml)" in done.err

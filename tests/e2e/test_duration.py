@@ -11,7 +11,7 @@ from crashhunt.errors import UsageError
 from crashhunt.ledger import Ledger
 from crashhunt.plans import Request
 
-HUNT = ("--scenario", "toy", "--seed", "4", "--arg", "speed=1", "--set", "step_wall_s=0.001")
+HUNT = ("--no-snapshot", "--scenario", "toy", "--seed", "4", "--arg", "speed=1", "--set", "step_wall_s=0.001")
 
 
 def test_a_hunt_ends_by_the_clock_and_continues_with_a_clock_of_its_own(toy):

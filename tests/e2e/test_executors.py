@@ -18,7 +18,7 @@ class Refuses:
 
         raise UsageError("nobody answers at 10.0.0.1", fix="start it")
 """
-WORDS = ("run", "h", "2", "4", "40", "--scenario", "toy", "--seed", "3", "--arg", "speed=5", "--keep-going")
+WORDS = ("run", "h", "2", "4", "40", "--scenario", "toy", "--seed", "3", "--arg", "speed=5", "--no-snapshot")
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import re
 import subprocess
 import tomllib
 import traceback
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,7 +22,6 @@ import crashhunt
 from crashhunt.cli import make_parser
 from crashhunt.errors import UsageError
 from crashhunt.guide import (
-    describe_api,
     describe_commands,
     describe_json,
     describe_keys,
@@ -33,6 +33,12 @@ from crashhunt.guide import (
 )
 
 TOPICS = [page.topic for page in list_pages()]
+
+
+@cache
+def text_of(topic: str) -> str:
+    """A page as it is shown; some take half a second."""
+    return find_page(topic).text(make_parser())
 
 
 def test_topics_are_listed(shell):
@@ -141,11 +147,11 @@ def test_the_commands_are_those_of_the_parser():
     assert "- `--scenario NAME|PATH`: " in text
     assert "`crashhunt status DIR [DIR ...]`" in text
     assert "`crashhunt suite run FILE DIR [PARALLEL]`" in text
-    assert text in find_page("commands").text(make_parser())
+    assert text in text_of("commands")
 
 
 def test_the_python_reference_has_what_users_import():
-    text = describe_api()
+    text = text_of("api")
     described = re.findall(r"^### (\S+)\.(\w+)$", text, re.MULTILINE)
     for name, public in described:
         assert getattr(importlib.import_module(name), public).__doc__, f"{name}.{public}"
@@ -182,7 +188,7 @@ def test_keys_of_outputs_are_those_of_the_schemas():
 
 
 def test_names_in_the_texts_of_parts_are_code():
-    text = find_page("observation-parts").text(make_parser())
+    text = text_of("observation-parts")
     assert "| `left` |  | 0:1 | with relation=true only: 1 if `same_lane` is 0, " in text
     assert "followed as far as `radius` |" in text
 
@@ -274,6 +280,5 @@ def test_a_topic_that_is_none_is_refused_from_python_too():
 
 def test_what_represents_the_reference_in_the_file_is_not_shown():
     for topic in ("commands", "api", "json", "toml", "modules"):
-        page = find_page(topic)
-        assert "shows them" in page.file.read_text()
-        assert "shows them" not in page.text(make_parser())
+        assert "shows them" in find_page(topic).file.read_text()
+        assert "shows them" not in text_of(topic)

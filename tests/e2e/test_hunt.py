@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import mostly_nightly, wait_for
 
-FINE = ("--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
+FINE = ("--no-snapshot", "--scenario", "toy", "--agent", "faulty:Fine", "--seed", "5", "--set", "step_wall_s=0.0005")
 LONG = ("30", *FINE[:-1], "step_wall_s=0.01")  # 0.3 s a trial, most of it asleep
 
 
@@ -62,7 +62,7 @@ def test_exactly_so_many_trials_run(toy, parallel, trials):
 def test_a_crash_stops_everything_at_once_even_hung_workers(toy):
     words = ("run", "h", "3", "30", "2000", "--agent", "faulty:HangsUnlessFirst", "--arg", "number=0:100")
     # Trial 0 of this seed gets number 0 with the grid; all others hang in C with the interpreter held.
-    words = (*words, "--sampler", "grid", "--points", "101", "--scenario", "toy", "--set", "gap_m=30")
+    words = (*words, "--sampler", "grid", "--points", "101", "--scenario", "toy", "--set", "gap_m=30", "--no-snapshot")
     process = toy.begin(*words, "--timeout", "120", "--json")
     crashes = toy.folder / "h" / "crashes"
     out, err = process.communicate(timeout=300)

@@ -18,7 +18,7 @@ from crashhunt.trial import Outcome
 
 def hunted(toy):
     """One error of the agent, for `made_once`, which another value of its argument avoids."""
-    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1")
+    words = ("--scenario", "toy", "--agent", "faulty:Raises", "--arg", "at=2|30", "--seed", "1", "--no-snapshot")
     toy.crashhunt("run", "h", "1", "9", "9", *words)
 
 

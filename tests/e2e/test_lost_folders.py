@@ -30,7 +30,7 @@ class Agent:
 
 def hunt(toy, expect):
     words = "run ../hunt 1 2 5 --scenario ../toy --agent agent:Agent --keep-going --set gap_m=60 --json --seed 1"
-    done = toy.crashhunt(*words.split(), expect=expect)
+    done = toy.crashhunt(*words.split(), "--no-snapshot", expect=expect)
     return json.loads(done.out)
 
 

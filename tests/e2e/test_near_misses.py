@@ -10,7 +10,8 @@ WORDS = ("run", "h", "1", "8", "30", "--scenario", "toy", "--seed", "4", "--keep
 
 
 def with_near_misses(toy):
-    (toy.folder / "run.json").write_text(json.dumps(toy.crashhunt(*WORDS, "--near-misses", "2", "--json").json))
+    done = toy.crashhunt(*WORDS, "--near-misses", "2", "--no-snapshot", "--json")
+    (toy.folder / "run.json").write_text(json.dumps(done.json))
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ class Follows:
         gap = min(rows[rows[:, of["ahead"]] > 0, of["ahead"]], default=1e9)
         return (0.0 if gap < 6.0 else self.speed, 0)
 '''
-WORDS = ("1", "2", "60", "--scenario", "toy", "--agent", "follows:Follows", "--seed", "5")
+WORDS = ("1", "2", "60", "--scenario", "toy", "--agent", "follows:Follows", "--seed", "5", "--no-snapshot")
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 QUIET = ("--set", "vehicles=10")
 TOY = ("--scenario", "toy")
+QUICK = ("--no-snapshot", "--json")
 FAULTS = [
     ("Raises", "agent_error", "ValueError", "no plan"),
     ("ExitsPython", "agent_error", "SystemExit", "1"),
@@ -94,7 +95,7 @@ def test_an_agent_that_does_not_start_is_refused_at_once(toy):
 
 
 def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
-    done = toy.crashhunt("run", "h", "1", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, "--json", expect=2)
+    done = toy.crashhunt("run", "h", "1", "500", "100", "--agent", "faulty:DiesAtStart", *TOY, *QUICK, expect=2)
     message = done.json["error"]["message"]
     assert message.startswith("faulty:DiesAtStart does not start: ")
     assert "exited with 7" in message
@@ -103,7 +104,7 @@ def test_process_that_dies_in_the_constructor_of_an_agent_is_no_crash(toy):
 
 def test_crash_on_decides_what_counts(toy):
     words = ("run", "h", "1", "2", "60", "--agent", "faulty:Raises", *TOY, "--json")
-    report = toy.crashhunt(*words, "--crash-on", "collision,hang").json
+    report = toy.crashhunt(*words, "--crash-on", "collision,hang", "--no-snapshot").json
     assert report["stopped_because"] == "all_trials"
     assert report["outcomes"] == {"agent_error": 2}
     assert report["crashes"] == []

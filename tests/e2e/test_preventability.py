@@ -14,7 +14,8 @@ MODELS = {"cc_human", "fsm", "rss", "reg157"}
 
 @pytest.mark.long
 def test_crash_of_a_blind_agent_is_preventable_in_all_outputs(shell):
-    shell.crashhunt("run", "h", "1", "2", "60", "--scenario", "r157-cut-in", "--agent", "keep-lane", "--seed", "1")
+    words = ("--scenario", "r157-cut-in", "--agent", "keep-lane", "--seed", "1", "--no-snapshot")
+    shell.crashhunt("run", "h", "1", "2", "60", *words)
     few = ("--runs", "1", "--why", "0", "--reference", "0")
     (judged,) = shell.crashhunt("judge", "h", *few, "--json").json["judged"]
     assert judged["preventable_by"] == dict.fromkeys(MODELS, True)

@@ -9,7 +9,7 @@ CALM = "calm=always (acceleration > -6)"
 
 
 def hunt(shell, *words, name="h", trials="12", expect=0):
-    options = ["--scenario", "toy", "--seed", "4", "--json"]
+    options = ["--scenario", "toy", "--seed", "4", "--no-snapshot", "--json"]
     return shell.crashhunt("run", name, "1", trials, "60", *options, *words, expect=expect)
 
 

@@ -39,7 +39,7 @@ def test_a_suite_that_has_changed_is_refused(toy):
 
     written(toy, SUITE)
     Suite.read(toy.folder / "suite.toml").plan(toy.folder / "out")
-    toy.crashhunt("run", "single", "1", "1", "5", "--scenario", "toy")
+    toy.crashhunt("run", "single", "1", "1", "5", "--scenario", "toy", "--no-snapshot")
     written(toy, SUITE.replace("speed = 4", "speed = 5"))
     refused = toy.crashhunt("suite", "run", "suite.toml", "out", expect=2)
     assert "the hunt 'slow' was planned in this folder with other settings" in refused.err
