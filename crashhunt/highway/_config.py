@@ -26,6 +26,7 @@ _Plain: TypeAlias = dict[str, int | float | str]
 Changes: TypeAlias = dict[type, _Plain]
 """Plain attributes of the classes of road objects in which an environment has changed one."""
 
+_NUMBER_OR_TEXT = (int, float, str)  # a union would be made again for each attribute of each class
 _pristine: Changes = {}
 _changes: Changes = {}  # in force: those of the environment that was reset last
 
@@ -95,7 +96,7 @@ def _kinds() -> Iterator[tuple[type, _Plain, _Plain]]:
     while waiting:
         kind = waiting.pop()
         waiting += kind.__subclasses__()
-        plain = {name: value for name, value in vars(kind).items() if isinstance(value, int | float | str)}
+        plain = {name: value for name, value in vars(kind).items() if isinstance(value, _NUMBER_OR_TEXT)}
         yield kind, plain, _pristine.setdefault(kind, plain)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import functools
 import hashlib
 import inspect
 import logging
@@ -404,6 +405,7 @@ def reason_against() -> str:
     return f"the compiled kernel is not used: {why_not()}" if kernel() is None else ""
 
 
+@functools.cache
 def installed_digest() -> str:
     """Return the digest of the modules of the installed highway-env in which the accelerator replaces something."""
     digest = hashlib.blake2b(digest_size=8)
@@ -436,12 +438,20 @@ _CONTEXT_MANAGER_CODE = contextmanager(lambda: iter(())).__code__
 
 def _functions() -> Iterator[tuple[str, Callable[..., object]]]:
     """Yield the current functions and methods of all classes and functions that the modules define, with names."""
+    for module, kind, name in _definitions():
+        owner = getattr(module, name)
+        members = vars(owner).items() if kind == "class" else [("", owner)]
+        for member, found in members:
+            function = getattr(found, "fget", None) or getattr(found, "__func__", found)
+            if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
+                yield f"{name}.{member}".rstrip("."), _without_context_manager(function)
+
+
+@functools.cache  # the source of a module that has been imported is read once
+def _definitions() -> list[tuple[ModuleType, str, str]]:
+    """Return the classes and functions that the source of each module defines: module, ``def`` or ``class``, name."""
+    found = []
     for module in _MODULES:
         source = Path(str(module.__file__)).read_text(encoding="utf-8")
-        for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE):
-            owner = getattr(module, name)
-            members = vars(owner).items() if kind == "class" else [("", owner)]
-            for member, found in members:
-                function = getattr(found, "fget", None) or getattr(found, "__func__", found)
-                if callable(function) and hasattr(function, "__module__") and not isinstance(function, type):
-                    yield f"{name}.{member}".rstrip("."), _without_context_manager(function)
+        found += [(module, kind, name) for kind, name in re.findall(r"^(def|class) (\w+)", source, re.MULTILINE)]
+    return found
