@@ -35,7 +35,7 @@ PYTHON = "#!/usr/bin/env python3\n" if " " in sys.executable else f"#!{sys.execu
 
 # The words of the command line: the harm, and the message at which it is done; none for a driver without harm.
 PROGRAM = """\
-import json, os, signal, subprocess, sys, time
+import json, os, signal, sys, time
 
 kind, when = [*sys.argv[1:], "", ""][:2]
 speed, in_trial = 12.0, False
@@ -81,6 +81,8 @@ def harm():
     elif kind == "late":
         time.sleep(100)
     elif kind == "children":
+        import subprocess  # here, because it takes longer to import than the others together
+
         started = subprocess.Popen(["sleep", "100"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         with open("child", "w") as file:
             file.write(str(started.pid))

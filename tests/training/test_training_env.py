@@ -179,7 +179,8 @@ def remote(crashes):
     made.close()
 
 
-@pytest.mark.parametrize("crash", [pytest.param("", marks=pytest.mark.nightly), None])
+@pytest.mark.nightly  # by day, that of an environment which repeats no crashes: tests/envs/test_sumo_env.py
+@pytest.mark.parametrize("crash", ["", None])
 def test_a_killed_process_is_reported_whatever_is_asked_next(remote, crash):
     remote.reset(seed=1)
     os.kill(remote._episodes.pid, signal.SIGKILL)

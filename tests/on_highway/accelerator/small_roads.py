@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from exact_values import exact
+from gymnasium.utils import seeding
 from highway_env.road.lane import StraightLane
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
@@ -32,6 +33,17 @@ def two_roads(poses):
     place = Road(network, np_random=np.random.default_rng(1))
     place.vehicles += [IDMVehicle(place, position, 0, speed, timer=timer) for position, speed, timer in poses]
     return place
+
+
+def begun(kind, config, seed=3):
+    """An environment that begins with a seed.
+
+    Its constructor resets it without one, and to reset it again takes as long as a step.
+    """
+    env = kind.__new__(kind)
+    env._np_random, _ = seeding.np_random(seed)
+    env.__init__(config)
+    return env
 
 
 def state(place):

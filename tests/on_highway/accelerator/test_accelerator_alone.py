@@ -10,6 +10,7 @@ import highway_env
 import numpy as np
 import pytest
 from compiled import needs_kernel
+from conftest import mostly_nightly
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.envs.intersection_env import ContinuousIntersectionEnv
@@ -17,7 +18,7 @@ from highway_env.road import regulation, road
 from highway_env.road.lane import StraightLane
 from highway_env.vehicle import behavior, dynamics
 from highway_env.vehicle.controller import ControlledVehicle
-from small_roads import same_either_way, state, two_roads
+from small_roads import begun, same_either_way, state, two_roads
 
 from crashhunt.highway.accelerator import Onlooker, _roads, _switch, kind_of, switch_on
 
@@ -26,9 +27,7 @@ pytestmark = [pytest.mark.usefixtures("plain_highway_env"), needs_kernel]
 
 
 def made(kind=HighwayEnvFast):
-    env = kind({"vehicles_count": 9, "vehicles_density": 1.6, "simulation_frequency": 8})
-    env.reset(seed=3)
-    return env
+    return begun(kind, {"vehicles_count": 9, "vehicles_density": 1.6, "simulation_frequency": 8})
 
 
 def both(make, drive):
@@ -279,8 +278,10 @@ class Skidding(dynamics.BicycleVehicle):
         return super().derivative_func(time, state, **kwargs) * 0.98
 
 
-@pytest.mark.parametrize("prediction", ["constant_steering", "zero_steering", "none"])
-@pytest.mark.parametrize("kind", [dynamics.BicycleVehicle, Skidding])
+FORESEEN = [(k, p) for k in (dynamics.BicycleVehicle, Skidding) for p in ("constant_steering", "zero_steering", "none")]
+
+
+@pytest.mark.parametrize(("kind", "prediction"), mostly_nightly(FORESEEN, [*FORESEEN[:3], FORESEEN[-1]]))
 def test_a_vehicle_by_the_dynamic_model_is_moved_and_foreseen_by_it(kind, prediction):
     def make():
         place = crossing(kind)

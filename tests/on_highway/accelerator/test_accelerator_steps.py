@@ -21,7 +21,7 @@ from highway_env.road.road import Road
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from small_roads import same_either_way
+from small_roads import begun, same_either_way
 
 from crashhunt.highway import HighwaySimulator
 from crashhunt.highway.accelerator import Onlooker, _substep_loop, switch_off, switch_on
@@ -55,9 +55,7 @@ def both(make, change=lambda env: None, actions=ACTIONS):
 
 
 def made(kind=HighwayEnvFast, **config):
-    env = kind({**CONFIG, **config})
-    env.reset(seed=3)
-    return env
+    return begun(kind, {**CONFIG, **config})
 
 
 @cache

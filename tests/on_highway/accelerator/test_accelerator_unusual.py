@@ -13,7 +13,7 @@ from exact_values import exact
 from highway_env.envs.highway_env import HighwayEnvFast
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from small_roads import same_either_way, state, two_roads
+from small_roads import begun, same_either_way, state, two_roads
 
 from crashhunt.highway.accelerator import _roads, switch_on
 
@@ -127,9 +127,7 @@ def test_an_error_is_that_of_the_same_vehicle_and_everybody_continues_as_after_i
 
 def environment(**config):
     config = {"vehicles_count": 9, "vehicles_density": 1.6, "simulation_frequency": 5, **config}
-    env = HighwayEnvFast(config)
-    env.reset(seed=3)
-    return env
+    return begun(HighwayEnvFast, config)
 
 
 @pytest.mark.parametrize("timer", [0.9, 5.0])  # of the second sub-step and of the first

@@ -30,7 +30,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
-from small_roads import same_either_way, small_road
+from small_roads import begun, same_either_way, small_road
 
 from crashhunt.highway.accelerator import (
     Onlooker,
@@ -196,8 +196,7 @@ def test_odd_settings_have_what_they_have_in_highway_env():
         return seen.dtype, seen.shape, seen.tobytes()
 
     def found():
-        env = HighwayEnvFast({**SMALL, "vehicles_count": 3})
-        env.reset(seed=4)
+        env = begun(HighwayEnvFast, {**SMALL, "vehicles_count": 3}, 4)
         every = []
         for setting in ODD:
             seeing = observation_factory(env, {"type": "Kinematics"})
@@ -295,8 +294,7 @@ def test_environment_is_left_as_highway_env_leaves_it():
     """Its counters, and the vehicles with every attribute, also after an error in a sub-step."""
 
     def left(kind, **config):
-        env = kind({**SMALL, "simulation_frequency": 6, "policy_frequency": 2, **config})
-        env.reset(seed=2)
+        env = begun(kind, {**SMALL, "simulation_frequency": 6, "policy_frequency": 2, **config}, 2)
         env.enable_auto_render = True
         trace = []
         for number in range(4):
@@ -321,8 +319,7 @@ def test_environment_is_left_as_highway_env_leaves_it():
 
 def test_agent_acts_once_in_each_period_whatever_steps_have_run_before():
     def acted(steps, action):
-        env = HighwayEnvFast({**SMALL, "simulation_frequency": 8})
-        env.reset(seed=2)
+        env = begun(HighwayEnvFast, {**SMALL, "simulation_frequency": 8}, 2)
         calls, act = [], env.action_type.act
         env.action_type.act = lambda action: (calls.append(env.steps), act(action))
         env.steps = steps
@@ -336,8 +333,7 @@ def test_agent_acts_once_in_each_period_whatever_steps_have_run_before():
 
 def test_usual_change_of_the_target_speed_needs_no_code_of_highway_env():
     assert switch_on() == ""
-    env = HighwayEnvFast(SMALL)
-    env.reset(seed=3)
+    env = begun(HighwayEnvFast, SMALL)
     vehicle, tables = env.vehicle, (env.vehicle.target_speeds, np.array([10, 20, 30]), np.array([20.0, 21.0]))
     before = {name: vars(vehicle)[name] for name in ("target_speed", "speed_index", "target_lane_index")}
     for action, table, speed in product((1, 3, 4, np.int64(3)), tables, (22.0, np.float64(-3), 99.0, 25, 15.0)):
