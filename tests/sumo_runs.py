@@ -6,11 +6,13 @@ import shutil
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 from episodes import record_run
 
 from crashhunt.scenario import Scenario, argument_values, load_scenario
 from crashhunt.sumo import SumoSetup, SumoSimulator
+from crashhunt.sumo._observing import ObservedParts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +61,9 @@ class SumoRuns(ExitStack):
         chosen = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
         if changes:
             chosen = replace(chosen, agents={**chosen.agents, "ego": replace(chosen.agents["ego"], **changes)})
-        return self.enter_context(closing(SumoSimulator(chosen, self.folder())))
+        # A worker prepares the whole network once; an episode of a test computes the few lanes that it needs.
+        with patch.object(ObservedParts, "prepare"):
+            return self.enter_context(closing(SumoSimulator(chosen, self.folder())))
 
     def begin(
         self, scenario: Scenario | Path | str, seed: int, arguments: dict[str, Any] | None = None, **changes: Any

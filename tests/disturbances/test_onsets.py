@@ -98,7 +98,7 @@ def test_agent_kinds_begin_two_steps_after_the_fork_and_others_one():
 def test_no_earlier_model_begins_effectively_in_the_step_of_the_onset():
     some = sampler(late_action=0.2, brake=0.2, cut_in=0.2)
     seen = set()
-    for seed in range(60):
+    for seed in range(examples(60)):
         for onset in run(FirstOnsets(some, Forcing(0.05), seed, 20), is_even, 20):
             together = {one.what for one in onset.planned if one.step == onset.step}
             name = onset.cell.partition("=")[0]

@@ -41,7 +41,7 @@ def simulator(tmp_path_factory):
 
 
 def driven(simulator, call, place="act", steps=6, oracles=(), overruled=None):
-    values = argument_values(load_scenario("loop"))
+    values = {**argument_values(load_scenario("loop")), "vehicles": 12}
     spec = TrialSpec(number=0, seed=1, arguments={}, scenario_arguments=values, max_steps=steps)
 
     def make_agent(*_):  # once there is a network

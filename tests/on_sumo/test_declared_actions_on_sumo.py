@@ -20,7 +20,8 @@ def start(sumo_runs):
     """Return a function that begins an episode in a form of actions, and returns a function that takes a step."""
 
     def begin(form, scenario="loop", seed=3, **values):
-        simulator, _ = sumo_runs.begin(with_action(load_scenario(scenario), "ego", form), seed, values)
+        few = {"vehicles": 12} if scenario == "loop" else {}
+        simulator, _ = sumo_runs.begin(with_action(load_scenario(scenario), "ego", form), seed, few | values)
 
         def step(action):
             simulator.step({"ego": simulator.actions["ego"].encode(action)})

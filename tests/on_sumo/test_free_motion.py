@@ -12,6 +12,7 @@ import libsumo
 import numpy as np
 import pytest
 import sumolib
+from conftest import mostly_nightly
 
 from crashhunt.base.errors import ActionError
 from crashhunt.oracles import Overlap
@@ -481,9 +482,14 @@ def test_trajectory_in_the_frame_of_the_vehicle_is_the_same_motion(start, tracke
     assert np.allclose(*courses, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize(("point", "share"), [("rear_axle", -0.3), ("front_bumper", 0.5)])
+@pytest.mark.parametrize(
+    ("frame", "point", "share"),
+    mostly_nightly(
+        [(frame, *one) for frame in ("map", "ego") for one in (("rear_axle", -0.3), ("front_bumper", 0.5))],
+        always=[("map", "rear_axle", -0.3), ("ego", "front_bumper", 0.5)],
+    ),
+)
 @pytest.mark.parametrize("form", ["trajectory", "trajectory:tracker=pure_pursuit", "target_pose"])
-@pytest.mark.parametrize("frame", ["map", "ego"])
 def test_plan_for_another_reference_point_is_the_same_motion(start, form, frame, point, share):
     """The plan in the map is moved along its headings; in the vehicle's frame, its own point is the origin."""
     courses = []

@@ -155,13 +155,13 @@ def rerouter(inside):
 @pytest.mark.parametrize(
     ("stop", "more"),
     [
-        ('<stop parkingArea="on" duration="12"/>', ""),
+        pytest.param('<stop parkingArea="on" duration="12"/>', "", marks=pytest.mark.nightly),
         (
             '<stop parkingArea="full" duration="12"/>',
             rerouter('<parkingAreaReroute id="full"/><parkingAreaReroute id="on"/>'),
         ),
         ("", rerouter('<closingReroute id="east"/>')),
-        ("", rerouter('<closingLaneReroute id="east_0"/>')),
+        pytest.param("", rerouter('<closingLaneReroute id="east_0"/>'), marks=pytest.mark.nightly),
         ('<stop lane="west_0" endPos="60" duration="3" jump="2"/><stop lane="east_0" endPos="60" duration="3"/>', ""),
         ("", '<vaporizer id="east" begin="0" end="900"/>'),
     ],

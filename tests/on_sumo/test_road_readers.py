@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 from itertools import pairwise
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import examples
 from crossing_lines import crossing
 
 libsumo = pytest.importorskip("libsumo")
@@ -71,14 +73,19 @@ def roads_of(edges):
     )
 
 
+@functools.cache
+def network_of(name):
+    """A network as sumolib reads it and as its graph, which tests do not change."""
+    path = PUBLIC.get(name, NETS / f"{name}.net.xml.gz")
+    graph = LaneGraph(read_network(path, with_junctions=True))
+    return path, sumolib.net.readNet(str(path), withInternal=True), graph, Conflicts(graph)
+
+
 class Town:
     """Vehicles that SUMO drives on random routes through a network, with a reader of each part for each of them."""
 
     def __init__(self, name, folder, vehicles=30):
-        path = PUBLIC.get(name, NETS / f"{name}.net.xml.gz")
-        self.net = sumolib.net.readNet(str(path), withInternal=True)
-        self.graph = LaneGraph(read_network(path, with_junctions=True))
-        self.conflicts = Conflicts(self.graph)
+        path, self.net, self.graph, self.conflicts = network_of(name)
         self.sign = -1 if self.graph.is_left_hand else 1
         draw = random.Random(5)
         lines = [f'<vType id="t" length="{LENGTH_M}"/>']
@@ -207,12 +214,16 @@ def shape_of(town, lane):
     return town.net.getLane(lane).getShape()
 
 
+SAMPLES = (54, 30, 42, 18, 6)[: examples(8)]
+"""The steps in which all vehicles are examined: more are on the road in the first ones here."""
+
+
 def test_points_of_lanes_lie_on_sumolibs_lanes_at_the_spacing(town):
     distance_to = sumolib.geomhelper.distancePointToPolygon
     along = sumolib.geomhelper.polygonOffsetWithMinimumDistanceToPoint
     points = others = 0
     for number, vehicles in enumerate(town.steps(60)):
-        for vehicle in vehicles if number % 12 == 6 else ():
+        for vehicle in vehicles if number in SAMPLES else ():
             shown = town.read(vehicle, "lanes")
             lane, (x, y) = libsumo.vehicle.getLaneID(vehicle), libsumo.vehicle.getPosition(vehicle)
             heading = math.radians(90 - libsumo.vehicle.getAngle(vehicle))
@@ -261,7 +272,7 @@ def is_beside(town, lane, own):
 def test_route_points_follow_the_edges_of_the_route(town):
     checked = 0
     for number, vehicles in enumerate(town.steps(60)):
-        for vehicle in vehicles if number % 12 == 6 else ():
+        for vehicle in vehicles if number in SAMPLES else ():
             if libsumo.vehicle.getLanePosition(vehicle) < LENGTH_M:  # its centre is not on its lane yet
                 continue
             shown = town.read(vehicle, "route")

@@ -57,12 +57,12 @@ def test_gaps_sides_and_speeds_are_those_of_the_scene(merge):
     assert min(seen.values()) > 5
 
 
-def test_looking_changes_nothing_in_the_simulation(merge):
+def test_looking_changes_nothing_in_the_simulation(sumo_runs):
     scenario = load_scenario("merge")
-    traces = []
+    merge, traces = sumo_runs.open(scenario), []
     for looks in (False, True):
         merge.reset(seed=5, options={"arguments": argument_values(scenario)})
-        for _ in range(120):
+        for _ in range(60):
             merge.step({"ego": merge.actions["ego"].encode((20.0, 0))})
             if looks:
                 merge.surroundings("ego")

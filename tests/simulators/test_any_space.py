@@ -168,7 +168,7 @@ PLAIN = st.recursive(
         st.lists(inner, max_size=4), st.lists(inner, max_size=4).map(tuple), st.dictionaries(st.text(), inner),
         st.lists(inner, max_size=3).map(lambda items: np.array([*items, None], object)),
     ),
-    max_leaves=8,
+    max_leaves=4,
 )  # fmt: skip
 SETS = st.frozensets(st.text(), max_size=4) | st.sets(st.integers(), max_size=4)
 
