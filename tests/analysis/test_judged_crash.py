@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from crashhunt.analysis import judge, judge_bundle
+from crashhunt.analysis import _avoidability, judge, judge_bundle
 from crashhunt.crashes import INTERRUPTED, find_bundle, judgement_of
 
 
@@ -69,14 +71,21 @@ def test_last_step_and_causes_of_a_crash_are_those_that_its_physics_give(crash):
     assert watched == [(done, 60 + 80 + 5 + 4) for done in range(1, 20 + 34 + others + 1)]
 
 
-def test_judging_again_keeps_the_parts_that_it_does_not_compute(crash):
+def test_judging_again_keeps_the_parts_that_it_does_not_compute(crash, monkeypatch):
     first = judge_bundle(crash, runs=1, why=2, reference=0, drivers=False, parallel=1)
     assert (judgement_of(first).runs, judgement_of(first).why.runs, judgement_of(first).why.left) == (1, 2, 32)
-    unwritten = judge_bundle(crash, runs=2, why=0, reference=0, drivers=False, parallel=1, write=False)
-    assert judgement_of(find_bundle(crash.hunt)) == judgement_of(first)
-    assert (judgement_of(unwritten).runs, judgement_of(unwritten).why) == (2, None)
-    second = judge_bundle(find_bundle(crash.hunt), runs=3, why=0, reference=0, drivers=False, parallel=1)
-    assert (judgement_of(second).runs, judgement_of(second).why) == (3, judgement_of(first).why)
+
+    def judged_again(_bundle, _options, *, runs, **_):  # without processes: what it finds is not the question here
+        brake = replace(judgement_of(first).attempts[0], endings=dict.fromkeys(range(runs), "hit"))
+        return replace(judgement_of(first), attempts=(brake,), why=None)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_avoidability, "judge", judged_again)
+        unwritten = judge_bundle(crash, runs=2, why=0, reference=0, drivers=False, parallel=1, write=False)
+        assert judgement_of(find_bundle(crash.hunt)) == judgement_of(first)
+        assert (judgement_of(unwritten).runs, judgement_of(unwritten).why) == (2, None)
+        second = judge_bundle(find_bundle(crash.hunt), runs=3, why=0, reference=0, drivers=False, parallel=1)
+        assert (judgement_of(second).runs, judgement_of(second).why) == (3, judgement_of(first).why)
     stopped = judge_bundle(second, runs=9, why=9, reference=9, drivers=True, parallel=1, stopped=lambda: True)
     assert (judgement_of(stopped).why_not, judgement_of(stopped).runs) == (INTERRUPTED, 0)
     assert judgement_of(find_bundle(crash.hunt)) == judgement_of(second)

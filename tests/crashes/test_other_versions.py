@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
+from conftest import examples
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from crashhunt.base.codec import ESSENTIAL, known_part, merged, required_in
@@ -25,7 +26,7 @@ from crashhunt.snapshots import Snapshot, environment_changes
 from crashhunt.trial import Outcome, Overruled, TrialResult, TrialSpec
 
 HUNT = next(iter(sorted((Path(__file__).parents[1] / "e2e" / "frozen").glob("*/hunt"))))
-shared = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=20)
+shared = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=examples(20))
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-9, 9) | st.text("ab", max_size=3),
     lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text("xyz", min_size=1), inner, max_size=2),
