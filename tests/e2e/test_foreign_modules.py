@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from functools import cache
 from importlib import metadata
 from importlib.util import find_spec
 
@@ -83,11 +84,16 @@ def test_a_foreign_module_is_imported_once_to_describe_it_and_once_for_trials_an
 # The current folder may be a stranger's. Each name there that Python or a package could import writes down that it ran.
 
 
-@pytest.fixture
-def strange_folder(shell):
+@cache
+def names_to_import():
     needed = [re.split(r"[^\w-]", requirement)[0] for requirement in metadata.requires("crashhunt") or ()]
     names = {*sys.stdlib_module_names, *metadata.packages_distributions(), *(name.replace("-", "_") for name in needed)}
-    for name in names - {"crashhunt"}:
+    return names - {"crashhunt"}
+
+
+@pytest.fixture
+def strange_folder(shell):
+    for name in names_to_import():
         tells = "import pathlib; pathlib.Path(__file__).with_suffix('.ran').touch(); raise SystemExit('ran')"
         (shell.folder / f"{name}.py").write_text(tells)
     return shell.folder

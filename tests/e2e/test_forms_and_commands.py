@@ -114,7 +114,7 @@ def outcome(shell, form, operation):
 def test_agent_that_was_overruled_is_not_blamed_for_poses_that_are_due_in_the_next_step(shell):
     (shell.folder / "blind.py").write_text(AGENT)
     words = ("--scenario", "motorway", "--agent", "blind:Planned", "--action", "target_pose", "--seed", "3")
-    shell.crashhunt("run", "h", "1", "1", "300", *words, "--no-snapshot")
+    shell.crashhunt("run", "h", "1", "1", "100", *words, "--no-snapshot")
     found = shell.crashhunt("whatif", "h", "--before", "3", "--overrule", "reference", "--json").json
     assert not found["outcomes"].get("agent_error"), found
     (judged,) = shell.crashhunt(
