@@ -127,16 +127,15 @@ def dangers(frames: Sequence[Frame], agents: Sequence[str], step_length_s: float
         times, found, who, names = measured
         at = int(found.argmax())
         if found[at] > most.danger:
-            most = DangerousMoment(
-                danger=float(found[at]), step=round(times[at] / step_length_s), agent=agent, other=names[who[at]]
-            )
+            step = int(_steps_of(times, count, step_length_s)[at])
+            most = DangerousMoment(danger=float(found[at]), step=step, agent=agent, other=names[who[at]])
         whole = np.maximum(whole, by_step(times, found, count, step_length_s))
     return whole, most
 
 
 def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Array:
     """Return the criticality of each scene: of the latest sample before it, or the greatest sample in its step."""
-    steps = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
+    steps = _steps_of(times, count, step_length_s)
     held = np.zeros(count)
     np.maximum.at(held, steps, found)
     known = np.zeros(count, bool)
@@ -145,6 +144,12 @@ def by_step(times: Array, found: Array, count: int, step_length_s: float) -> Arr
     present = (last >= 0) & (np.arange(count) <= steps[-1])
     whole: Array = np.where(present, held[last], 0.0)
     return whole
+
+
+def _steps_of(times: Array, count: int, step_length_s: float) -> NDArray[np.int_]:
+    """Return the number of the step in which each sample lies."""
+    steps: NDArray[np.int_] = np.clip(np.ceil(times / step_length_s - 1e-6).astype(int), 0, max(0, count - 1))
+    return steps
 
 
 def summed_danger(integral_s: float) -> float:
@@ -399,13 +404,8 @@ def followers_danger(frames: Sequence[Frame], agent: str, step_length_s: float) 
     at = int(found.argmax())
     if who[at] < 0:
         return whole, nothing, total
-    return (
-        whole,
-        DangerousMoment(
-            danger=float(found[at]), step=round(track.time[at] / step_length_s), agent=agent, other=names[who[at]]
-        ),
-        total,
-    )
+    step = int(_steps_of(track.time, count, step_length_s)[at])
+    return whole, DangerousMoment(danger=float(found[at]), step=step, agent=agent, other=names[who[at]]), total
 
 
 def _behind(track: Track, others: Others) -> list[int]:

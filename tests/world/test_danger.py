@@ -201,6 +201,16 @@ def test_a_step_has_the_danger_of_the_sample_before_it_and_none_where_the_agent_
     assert most.step >= 40
 
 
+@pytest.mark.parametrize("start", range(-40, -20))
+def test_most_critical_moment_of_long_steps_lies_in_the_step_of_its_criticality(start):
+    """Between two scenes, the agent is behind an actor that crosses, and ahead of another one that follows it."""
+    ways = [straight(0, 0, 0, 8, 9, 1.0), straight(35, start, math.pi / 2, 7, 9, 1.0), straight(-20, 0, 0, 9, 9, 1.0)]
+    steps, most = level(*ways, step_s=1.0)
+    assert steps[most.step] == most.danger > 0
+    behind, closest, _ = followers_danger([frame(*ways, step_s=1.0)], "ego", 1.0)
+    assert behind[closest.step] == closest.danger > 0
+
+
 places = st.floats(-40, 40)
 others = st.tuples(places, places, st.floats(-3.1, 3.1), st.floats(2, 20), st.floats(-0.3, 0.3))
 
