@@ -107,12 +107,12 @@ def test_counts_are_those_of_the_ledger_in_any_order(tmp_path_factory, count, rn
 @pytest.mark.parametrize("at_once", [True, False])
 def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, at_once):
     monkeypatch.setattr(_plotted_trials, "MAX_POINTS", 100)
-    crashed = set(random.Random(1).sample(range(3_000), 60))
+    crashed = set(random.Random(1).sample(range(1_000), 20))
     path = tmp_path / "ledger.sqlite"
     sample, counts = Sample(CRASH_ON), TrialCounts(CRASH_ON)
     with closing(Ledger(path, writable=True)) as ledger, ledger.together():
-        for begin in range(0, 3_000, 3_000 if at_once else 250):
-            numbers = range(begin, begin + (3_000 if at_once else 250))
+        for begin in range(0, 1_000, 1_000 if at_once else 125):
+            numbers = range(begin, begin + (1_000 if at_once else 125))
             record(ledger, (trial(n, Outcome.COLLISION if n in crashed else Outcome.SURVIVED) for n in numbers))
             first = counts.last < 0
             new = counts.refresh(ledger)
@@ -126,7 +126,7 @@ def test_the_sample_keeps_all_crashes_and_an_even_share(tmp_path, monkeypatch, a
     others = sorted(point["number"] for point in sample.points if not point["crash"])
     assert 40 <= len(others) <= 100
     assert len(others) == len(set(others))
-    tenths = Counter(number // 300 for number in others)  # evenly over the hunt
+    tenths = Counter(number // 100 for number in others)  # evenly over the hunt
     assert all(abs(tenths[tenth] - len(others) / 10) <= 3 for tenth in range(10))
     assert sample.points[0]["values"].keys() == {"speed", "cars"}
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from crashhunt import recording
 from crashhunt.base.integrity import digest_of_data
 from crashhunt.base.process_owners import this_process
 from crashhunt.crashes import export_crash, find_bundle
@@ -26,12 +27,27 @@ from crashhunt.trial import Outcome
 
 FROZEN = Path(__file__).parents[1] / "e2e" / "frozen" / "version-1" / "hunt"
 CRASH = "000000-collision"
+READ: dict[bytes, recording.Recording] = {}  # by the content of its log
 
 
 @pytest.fixture
 def hunt(tmp_path):
     """A hunt of four trials on the toy, of which 0 and 2 crashed."""
     return Path(shutil.copytree(FROZEN, tmp_path / "h"))
+
+
+@pytest.fixture(autouse=True)
+def _read_once(monkeypatch):
+    """Read each log once for all tests: to decode it takes longer than the rest of a check."""
+    read = recording.read_log
+
+    def read_log(path):
+        content = path.read_bytes() if path.is_file() else b""
+        if content not in READ:
+            READ[content] = read(path)
+        return READ[content]
+
+    monkeypatch.setattr(recording, "read_log", read_log)
 
 
 def found_in(path):

@@ -8,6 +8,7 @@ import sqlite3
 from contextlib import closing
 
 import pytest
+from conftest import examples
 
 from crashhunt.errors import HuntDirectoryError
 from crashhunt.ledger import Ledger
@@ -152,7 +153,7 @@ def test_any_damage_is_reported_or_changes_nothing(whole, tmp_path):
     generator = random.Random(10)
     right = answers(whole)
     data = whole.read_bytes()
-    for _ in range(60):
+    for _ in range(examples(60)):
         damage = bytearray(data)
         kind, place = generator.randrange(4), generator.randrange(len(data))
         if kind == 0:

@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from types import SimpleNamespace
 
 import pytest
+from conftest import examples
 
 from crashhunt.errors import BusyError, HuntDirectoryError
 from crashhunt.plans import HuntSettings
@@ -34,7 +35,7 @@ def _claim(path, said, meeting, *, is_first):
             busy += 1
             meeting.wait()
         had = 0
-        while had < 50:
+        while had < examples(50):
             try:
                 with place.locked():
                     place.claim(SETTINGS, ["crashhunt"], overwrite=had % 5 == 4, seed_given=True)
