@@ -68,6 +68,15 @@ def format_time(seconds: float, step_length_s: float) -> str:
     return f"{seconds:.{1 if abs(tenths - round(tenths)) < 1e-6 else 2}f} s"
 
 
+def format_clock(seconds: float) -> str:
+    """Return a simulation time in s as text, with two decimals if it is no multiple of 0.1 s.
+
+    >>> format_clock(27.300000000000004), format_clock(19.45), format_clock(26)
+    ('27.3 s', '19.45 s', '26.0 s')
+    """
+    return f"{seconds:.2f}".removesuffix("0") + " s"
+
+
 def format_number(value: float, digits: int = 3) -> str:
     """Return a number for users with three significant digits; a whole number below 1,000,000 in full, with commas.
 

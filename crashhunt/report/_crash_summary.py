@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from crashhunt.base.text import command_line, count_of
+from crashhunt.base.text import command_line, count_of, format_clock
 from crashhunt.crashes import own_frames
 from crashhunt.report._argument_words import format_inputs
 from crashhunt.report._disturbance_words import list_disturbances
@@ -31,7 +31,7 @@ def describe_crash(bundle: Bundle) -> list[str]:
     lines = [
         f"{bundle.id}  ({result.outcome.category})",
         f"  {result.summary}",
-        f"  after {count_of(result.steps, 'step')}, simulation time {result.sim_time_s:.1f} s",
+        f"  after {count_of(result.steps, 'step')}, simulation time {format_clock(result.sim_time_s)}",
         f"  {format_inputs(result)}",
     ]
     lines += [f"  {line}" for line in (*_evidence(result), *list_disturbances(result))]

@@ -143,7 +143,7 @@ def _describe_types(report: HuntReport) -> list[str]:
         lines.append(f"  {group.count:{width}}  {group.signature}{fault}")
         lines.append(f"  {'':{width}}  shortest {shortest.id}: {shortest.result.summary}")
     if len(groups) > _MAX_TYPES:
-        lines.append(f"  and {len(groups) - _MAX_TYPES} more types")
+        lines.append(f"  and {count_of(len(groups) - _MAX_TYPES, 'more type')}")
     confirmed = sum(bundle.confirmed is True for bundle in crashes)
     lines.append(f"{confirmed} of {len(crashes)} bundles confirmed: bit-identical when replayed in a new process")
     flaky = [bundle.id for bundle in crashes if bundle.confirmed is False]

@@ -18,6 +18,7 @@ import numpy as np
 from crashhunt.base import layout
 from crashhunt.base.files import output_file
 from crashhunt.base.progress import Watch, watched
+from crashhunt.base.text import format_clock
 from crashhunt.base.version import __version__
 from crashhunt.crashes import closest_actors, read_notes, signature_of
 from crashhunt.ledger import Ledger, has_begun
@@ -360,7 +361,7 @@ def _crash(bundle: Bundle, story: Story) -> dict[str, object]:
             "trial": str(result.spec.number),
             "seed": str(result.spec.seed),
             "steps": str(result.steps),
-            "simulation time": f"{result.sim_time_s:.1f} s",
+            "simulation time": format_clock(result.sim_time_s),
             **(
                 {"at fault": fault_words(story.fault.verdict)}
                 if story.encounter is not None and story.nearest is None

@@ -142,7 +142,7 @@ def found_types(types, each):
     )
 
 
-@pytest.mark.parametrize(("types", "each"), [(1, 2), (1, 40), (5, 9), (30, 3)])
+@pytest.mark.parametrize(("types", "each"), [(1, 2), (1, 40), (5, 9), (6, 3), (30, 3)])
 def test_end_of_a_hunt_fits_a_screen_with_the_counts_and_the_next_commands_last(types, each):
     near = tuple(SimpleNamespace(id=f"{one}-survived", result=replace(FINE, danger=0.5)) for one in range(9))
     report = replace(found_types(types, each), near_misses=near, notes=("SUMO omits x",))
@@ -152,7 +152,9 @@ def test_end_of_a_hunt_fits_a_screen_with_the_counts_and_the_next_commands_last(
     assert max(map(len, found)) <= 120
     assert [line.strip() for line in found].count("shortest 000000-collision: ego drove into x at step 30") == 1
     assert sum("shortest " in line for line in found) == min(types, 5)
-    assert ("  and 25 more types" in found) is (types == 30)
+    assert [line for line in found if line.startswith("  and ")] == {
+        6: ["  and 1 more type"], 30: ["  and 25 more types"],
+    }.get(types, [])  # fmt: skip
     assert f"{types * each} of {types * each} bundles confirmed: bit-identical when replayed in a new process" in found
     assert found[-4].startswith("30 of 30 trials, 1200 steps, 0:12 ")
     assert found[-3:] == [
@@ -162,6 +164,13 @@ def test_end_of_a_hunt_fits_a_screen_with_the_counts_and_the_next_commands_last(
     ]
     with_page = describe_hunt(report, has_dashboard=True).splitlines()
     assert with_page == [*found, "Look at it:  crashhunt dashboard 'my hunt'"]
+
+
+def test_crash_has_the_time_at_which_its_step_ended():
+    """A step of 0.05 s ends between two tenths."""
+    report = found_types(1, 1)
+    report.crashes[0].result, report.crashes[0].divergence = replace(CRASH, sim_time_s=19.45), None
+    assert any(line.endswith(", simulation time 19.45 s") for line in describe_hunt(report).splitlines())
 
 
 def test_crashes_that_are_flaky_or_not_confirmed_are_named_among_many():
