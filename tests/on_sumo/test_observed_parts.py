@@ -71,7 +71,7 @@ def test_sumo_has_a_reader_for_each_of_its_parts():
     ("name", "speed"),
     mostly_nightly(
         [("loop", 9.0), ("intersection", 13.0), ("merge", 13.0), ("motorway", 9.0)],
-        always=[("loop", 9.0), ("motorway", 9.0)],  # of which the loop has headings in all directions
+        always=[("loop", 9.0), ("motorway", 9.0)],
     ),
 )
 def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
@@ -81,7 +81,10 @@ def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
         )
         previous, leaders, seen = None, 0, 0
         start = time = None
-        for shown in episode(simulator, 7, STEPS, speed=speed, change=name == "motorway"):
+        steps = STEPS
+        if name == "loop":  # into the bend, where all terms of a turn count, and read by Python as without the core
+            steps, simulator._parts.core = 220, None
+        for shown in episode(simulator, 7, steps, speed=speed, change=name == "motorway"):
             agent = next(iter(simulator.observation_layouts))
             assert simulator.observation_layouts[agent].space.contains(shown)
             own = {column: shown["ego"][index] for column, index in ego.items()}
@@ -124,9 +127,9 @@ def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
                 seen += 1
                 if getters.getLaneID(one) == getters.getLaneID(agent):
                     assert actor["same_lane"]
-                if previous is not None and one in previous:
+                if previous is not None and previous.get(one, (0, 0))[1] == getters.getAngle(one):
                     # The centre moves along the heading, apart from turns and from changes of lane, which are jumps.
-                    moved = (center(one) - previous[one]) / simulator.step_length_s
+                    moved = (center(one) - previous[one][0]) / simulator.step_length_s
                     if abs(actor["lane_offset"]) < 0.01 and np.hypot(*moved) < 40.0 and abs(moved[1] * moved[0]) < 1.0:
                         assert (actor["vx"], actor["vy"]) == pytest.approx(tuple(moved), abs=1.1)
             leader = getters.getLeader(agent, 60.0)
@@ -135,7 +138,7 @@ def test_ego_and_actors_are_what_libsumo_reports(name, speed, tmp_path):
                 assert row[actors["same_lane"]]
                 assert row[actors["ahead"]] > 0
                 leaders += 1
-            previous = {one: center(one) for one in others}
+            previous = {one: (center(one), getters.getAngle(one)) for one in others}
         assert seen > 50
         assert leaders > 10
 
