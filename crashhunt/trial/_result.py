@@ -181,7 +181,8 @@ def _summarize(
             whose = f"{failure.agent}: " if failure.agent else ""
             if failure.party not in ("", "agent", "simulator"):
                 whose = f"{failure.party} ({failure.place}): "
-            return f"{whose}{failure.kind}: {failure.message}"
+            # A bare `assert`, or `next` at the end of an iterator, has no message.
+            return f"{whose}{failure.kind}: {failure.message}" if failure.message else f"{whose}{failure.kind}"
         return failure.message
     return f"{outcome} after {count_of(steps, 'step')}"
 

@@ -36,6 +36,7 @@ def hit(role: str, collider: str, victim: str, kind: str = "") -> Collision:
         (Outcome.OFF_ROAD, {"collision": hit("alone", "ego", "", "off_road")}, "ego left the road at step 9"),
         (Outcome.RED_LIGHT, {"event": Event("red_light", "ego", "ego ran 'c'")}, "ego ran 'c', at step 9"),
         (Outcome.AGENT_ERROR, {"failure": Failure("KeyError", "'x'", "Trace", "ego")}, "ego: KeyError: 'x'"),
+        (Outcome.AGENT_ERROR, {"failure": Failure("AssertionError", "", "Trace", "ego")}, "ego: AssertionError"),
         (Outcome.SIMULATOR_ERROR, {"failure": Failure("KeyError", "'x'", "Trace")}, "KeyError: 'x'"),
         (Outcome.HANG, {"failure": Failure("timeout", "it hung", "the stack", "ego")}, "it hung"),
         (Outcome.PROCESS_DIED, {"failure": Failure("signal", "killed", "Trace", exit_code=-9)}, "killed"),
