@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class KnownTrials:
-    """What a process of some trials does not compute anew for each of the parameters that are tried.
+    """What a process of some trials computes only once, and not for each of the parameters that are tried.
 
     Args:
         points: trials x arguments; a choice is the index of its value.
