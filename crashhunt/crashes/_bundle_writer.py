@@ -31,7 +31,7 @@ def collect_output(result: TrialResult, scratch: Path, target: Path) -> None:
         shutil.copyfile(run_log, target / layout.RUN_LOG)
     failure = result.failure
     if failure is not None:
-        parts = (f"{failure.kind}: {failure.message}", failure.traceback, failure.last_output)
+        parts = (failure.line, failure.traceback, failure.last_output)
         text = "\n\n".join(part.rstrip() for part in parts if part.strip())
         (target / layout.ERROR_LOG).write_text(text + "\n", encoding="utf-8", errors="replace")
 

@@ -321,7 +321,8 @@ class _Zygote:
         self._staged = self._changed_at()
         self._offer_reused()
         if remaining := self._trial.record_shared_state(self._control.fileno()):
-            self._notices.append(f"trials are not wholly apart: a module shares {remaining} with every one of them")
+            shared = f"a module shares {remaining} with every one of them"
+            self._notices.append(f"trials are not wholly apart: {shared}; if it is yours, open this in reset instead")
         gc.freeze()  # a collection in a fork would copy the page of every object
         self._report({"ready": os.getpid()})
         while (message := self._next()) is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TextIO
 
 from crashhunt.base.codec import Serializable, null_is
-from crashhunt.base.text import format_number
+from crashhunt.base.text import count_of, format_number
 from crashhunt.statistics._anytime_interval import Interval
 from crashhunt.statistics._counted_trials import PER_WORDS, Per
 from crashhunt.trial import Outcome
@@ -141,7 +141,8 @@ class Pair(Serializable):
             )
         else:
             what = (
-                f"of {self.trials} trials with the same seeds, {self.only_first} crash only in {self.first}, "
+                f"of {count_of(self.trials, 'trial')} with the same seeds, "
+                f"{self.only_first} crash only in {self.first}, "
                 f"{self.only_second} only in {self.second}, {self.both} in both"
             )
         if self.evidence is not None:

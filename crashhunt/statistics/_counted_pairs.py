@@ -154,4 +154,4 @@ def reason_of(trial: TrialFacts) -> str:
     if failure.exit_code is not None or failure.kind == "timeout" or not failure.traceback:
         return failure.message
     place = f" ({failure.agent or failure.party}, {failure.place})" if failure.place else ""
-    return f"{failure.kind}: {failure.message}{place}"
+    return f"{failure.line}{place}"

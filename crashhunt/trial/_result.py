@@ -152,6 +152,12 @@ class Failure(Serializable):
             object.__setattr__(self, name, encodable(getattr(self, name)))
 
     @property
+    def line(self) -> str:
+        """The kind and the message, in one line."""
+        # A bare `assert`, or `next` at the end of an iterator, has no message.
+        return f"{self.kind}: {self.message}" if self.message else self.kind
+
+    @property
     def is_of_users_code(self) -> bool:
         """Whether code of the user certainly failed, and not its surroundings: memory, disk, network or a signal.
 
@@ -181,8 +187,7 @@ def _summarize(
             whose = f"{failure.agent}: " if failure.agent else ""
             if failure.party not in ("", "agent", "simulator"):
                 whose = f"{failure.party} ({failure.place}): "
-            # A bare `assert`, or `next` at the end of an iterator, has no message.
-            return f"{whose}{failure.kind}: {failure.message}" if failure.message else f"{whose}{failure.kind}"
+            return f"{whose}{failure.line}"
         return failure.message
     return f"{outcome} after {count_of(steps, 'step')}"
 

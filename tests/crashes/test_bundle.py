@@ -218,6 +218,8 @@ def test_a_fault_comes_with_what_was_said(tmp_path):
     assert found.driver == "b"
     silent = dataclasses.replace(result, failure=Failure("signal", "killed", exit_code=-9))
     assert (made(tmp_path, silent).path / "error.log").read_text() == "signal: killed\n"
+    bare = dataclasses.replace(result, failure=Failure("AssertionError"))
+    assert (made(tmp_path, bare).path / "error.log").read_text() == "AssertionError\n"
 
 
 def test_the_driver_is_which_it_is_about(bundle, tmp_path):

@@ -250,7 +250,10 @@ def test_zygote_reports_each_trial_and_whether_another_may_follow(zygote, monkey
         supervisor.sendall(json.dumps(job(number)).encode() + b"\n" + b'{"kill": true}\n')
     supervisor.shutdown(socket.SHUT_WR)
     zygote.serve()
-    notice = "trials are not wholly apart: a module shares a pipe with every one of them"
+    notice = (
+        "trials are not wholly apart: a module shares a pipe with every one of them; if it is yours, "
+        "open this in reset instead"
+    )
     assert sent(supervisor) == [
         {"ready": os.getpid()},
         {"ended": 0, "pid": PID, "unfit": False, "notices": [notice]},

@@ -68,6 +68,11 @@ def hunt(
     return path
 
 
+def test_a_single_pair_is_one_trial(tmp_path):
+    (pair,) = crashhunt.compare(hunt(tmp_path / "one", 1, trials=1), hunt(tmp_path / "two", 0, trials=1)).pairs
+    assert "of 1 trial with the same seeds, 1 crash only in " in pair.verdict
+
+
 def test_same_seeds_are_pairs_only_in_the_same_traffic(tmp_path):
     first, discordant = hunt(tmp_path / "first", 20), PairTest()
     discordant.add_counts(18, 0, 22)
