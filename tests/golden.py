@@ -16,11 +16,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from crashhunt.base.integrity import digest_of_data
-from crashhunt.snapshots import environment
+from crashhunt.snapshots import processor, vector_extension
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "tests" / "golden"
@@ -41,7 +40,6 @@ _CODE_LINE = re.compile(r"\.py:\d+")
 # Sentences for people: their wording is no interface, and a golden file must not change where only a message does.
 _PROSE = {"detail", "fix", "help", "message", "notes", "reason", "summary", "title", "words"}
 _MANY_WORDS = 4
-_ROUNDED_BY_PROCESSOR = {"intersection-highway-env", "intersection-two-agents", "roundabout"}  # seen on two kinds
 _ROWS = 15  # of a longer list of objects, the first and the last are written, and a digest of all
 
 
@@ -98,9 +96,8 @@ def need_versions(name: str, *packages: str) -> dict[str, str]:
     where the extensions are the same.
     """
     found = {package: version(package) for package in packages} | {"machine": platform.machine()}
-    if Path(name).stem in _ROUNDED_BY_PROCESSOR:
-        found["simd"] = np.show_config(mode="dicts")["SIMD Extensions"]["found"][-1]
-        found["processor"] = environment()["cpu"]
+    if Path(name).parent.name == "trials" and "highway-env" in packages:
+        found |= {"simd": vector_extension(), "processor": processor()}
     path = GOLDEN / name
     if not WRITE and path.exists():
         expected = json.loads(path.read_text(encoding="utf-8"))["versions"]

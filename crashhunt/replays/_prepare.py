@@ -16,7 +16,14 @@ from crashhunt.episode import WorkerSettings
 from crashhunt.plans import read_settings, with_settings
 from crashhunt.replays._edits import edited_spec
 from crashhunt.scenario import argument_values, load_order_change, load_scenario, with_recorded_load_order
-from crashhunt.snapshots import Snapshot, code_differences, environment_changes, processor, program_warnings
+from crashhunt.snapshots import (
+    Snapshot,
+    code_differences,
+    environment_changes,
+    processor,
+    program_warnings,
+    vector_extension,
+)
 from crashhunt.trial import SENSOR_KINDS
 from crashhunt.trial_reruns import Reruns, Where
 
@@ -182,9 +189,12 @@ def _machine_warnings(scenario: Scenario, snapshot: Snapshot) -> Iterator[str]:
         yield f"{name} was {then} and is {now}"
     if changed := load_order_change(scenario, environment.get("load_order")):
         yield changed
-    there, here = environment.get("cpu", ""), processor()
-    if scenario.backend.per_processor and there != here:
+    if not scenario.backend.per_processor:
+        return
+    if (there := environment.get("cpu", "")) != (here := processor()):
         yield f"the processor was {there!r} and is {here!r}, on which NumPy may round otherwise"
+    elif (there := environment.get("simd", "")) and there != (here := vector_extension()):
+        yield f"the processor had the vector extension {there} and has {here}, with which NumPy may round otherwise"
 
 
 def _with_recorded_actions(

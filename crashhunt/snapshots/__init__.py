@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         environment as environment,
         environment_changes as environment_changes,
         processor as processor,
+        vector_extension as vector_extension,
         versions as versions,
     )
     from ._snapshot import Snapshot as Snapshot, latest_snapshot as latest_snapshot, without_code as without_code

@@ -6,7 +6,7 @@ import platform
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, cast
 
 from crashhunt.base.plugins import ImportedModules, distributions as installed
 from crashhunt.scenario import installed_backends
@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 class Environment(TypedDict):
     """The contents of ``environment.json``: everything besides code on which a result depends.
 
-    The entry ``git`` has the revision of each work tree. The entry ``core`` is whether the simulator's compiled core
-    was used, which does not change results. The entry ``origins`` has folders of the snapshot and the user's folders
-    that they copy. If results depend on an order at load, ``load_order`` is ``fixed`` or ``not fixed: REASON``.
-    Without ``load_order``, the order was not fixed. The entry ``programs`` has architecture, build id and libraries of
-    the programs of agents, by their words in the command line.
+    The entry ``simd`` is missing in snapshots of earlier versions. The entry ``git`` has the revision of each work
+    tree. The entry ``core`` is whether the simulator's compiled core was used, which does not change results. The entry
+    ``origins`` has folders of the snapshot and the user's folders that they copy. If results depend on an order at
+    load, ``load_order`` is ``fixed`` or ``not fixed: REASON``. Without ``load_order``, the order was not fixed. The
+    entry ``programs`` has architecture, build id and libraries of the programs of agents, by their words in the command
+    line.
     """
 
     schema: int
@@ -37,6 +38,7 @@ class Environment(TypedDict):
     distributions: dict[str, str]
     loaded: list[str]
     variables: dict[str, str]
+    simd: NotRequired[str]
     core: NotRequired[str]
     load_order: NotRequired[str]
     programs: NotRequired[dict[str, BinaryFacts]]
@@ -74,6 +76,7 @@ def environment(imported: ImportedModules | None = None) -> Environment:
         "platform": platform.platform(),
         "machine": platform.machine(),
         "cpu": processor(),
+        "simd": vector_extension(),
         "versions": named,
         "distributions": dict(sorted(distributions.items(), key=lambda item: item[0].lower())),
         "loaded": sorted(loaded, key=str.lower),
@@ -162,6 +165,18 @@ def processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+
+
+def vector_extension() -> str:
+    """Return the last vector extension of the processor that NumPy uses, such as ``X86_V3`` or ``AVX512_ICL``.
+
+    NumPy rounds sines differently with AVX-512. The model does not state it: virtual machines with and without this
+    extension may both have the model ``AMD EPYC``.
+    """
+    import numpy as np
+
+    config = cast("dict[str, dict[str, list[str]]]", np.show_config(mode="dicts"))
+    return config.get("SIMD Extensions", {}).get("found", [""])[-1]
 
 
 def environment_of_simulation(found: Environment) -> Environment:

@@ -144,7 +144,7 @@ class Snapshot:
         try:
             found = read_object(file, Environment)
             known: dict[str, object] = {"distributions": dict[str, str], "loaded": list[str]}
-            known |= dict.fromkeys(("python", "implementation", "machine", "cpu"), str)
+            known |= dict.fromkeys(("python", "implementation", "machine", "cpu", "simd"), str)
             typed_where_there(found, known)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error

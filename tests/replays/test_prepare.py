@@ -129,6 +129,7 @@ def prepared(monkeypatch, tmp_path):
         "with_recorded_load_order": with_order,
         "load_order_change": lambda scenario, order: given.order,
         "environment_changes": lambda environment: {"numpy": ("1", "2")}, "processor": lambda: "here",
+        "vector_extension": lambda: "X86_V3",
         "refuse_side_effects": lambda *words: given.asked.append(("side effects", words[1:])),
         "landlock_version": lambda: given.landlock,
     }.items():  # fmt: skip
@@ -234,6 +235,10 @@ def test_replay_on_another_processor_is_warned_of(prepared, monkeypatch):
     assert "'there' and is 'here'" in prepared.run().warnings[-1]
     prepared.environment["cpu"] = "here"
     assert len(prepared.run().warnings) == 2
+    prepared.environment["simd"] = "X86_V3"
+    assert len(prepared.run().warnings) == 2
+    prepared.environment["simd"] = "AVX512_ICL"
+    assert "extension AVX512_ICL and has X86_V3" in prepared.run().warnings[-1]
     defaults = prepared.run().defaults
     known = scenario.scenario_arguments()
     assert {name: defaults["", name] for name in known} == {name: one.default for name, one in known.items()}

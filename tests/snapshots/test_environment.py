@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from importlib import import_module, metadata
 
+import numpy as np
+
 from crashhunt.snapshots import environment, environment_changes, versions
 
 
@@ -22,6 +24,11 @@ def test_distributions_and_those_that_are_loaded_are_what_importlib_states():
     assert set(found["loaded"]) == imported | found["versions"].keys() - {"python"}
     for name in ("crashhunt", "numpy", "libsumo"):
         assert versions()[name] == found["distributions"][name] == metadata.version(name)
+
+
+def test_vector_extension_is_the_last_one_that_numpy_has_found():
+    found = np.show_config(mode="dicts")["SIMD Extensions"]["found"]
+    assert [environment()["simd"]] == (found[-1:] or [""])
 
 
 def test_of_two_versions_the_one_that_is_imported_is_recorded(tmp_path, monkeypatch):
