@@ -161,7 +161,7 @@ def test_compiled_core_writes_the_observations_of_the_driver_like_python(name, s
         scenario = scenario.with_table(replace(scenario.table(SumoSetup), native=native))
         simulator = sumo_runs.open(scenario)
         agent = kind(simulator.observation_layouts["ego"].columns)
-        spec = TrialSpec(0, seed, {}, argument_values(scenario), max_steps=200)
+        spec = TrialSpec(0, seed, {}, argument_values(scenario), max_steps=400)
         result, _ = sumo_runs.record(simulator, spec, agent, oracles=[], crash_on=())
         found.append((result.digest, result.steps))
         # Without the core, Python reads each step; with it, only the parts and steps that the core does not write.
