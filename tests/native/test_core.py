@@ -591,7 +591,7 @@ class _StopsAndGoes:
 def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
     agents = _StopsAndGoes(), _StopsAndGoes()
     (ours, simulator), (theirs, _) = (
-        run(scenario, native=native, steps=75, parts=parts, agent=agent)
+        run(scenario, native=native, steps=100, parts=parts, agent=agent)
         for native, agent in zip((None, False), agents, strict=True)
     )
     assert simulator._sight.core is core
@@ -606,7 +606,8 @@ def test_parts_of_observations_are_the_same_bit_by_bit(run, scenario, parts):
 
 @pytest.mark.parametrize("scenario", ["loop", "loop-two-agents"])
 def test_a_trial_is_the_same_bit_by_bit(run, scenario):
-    (ours, simulator), (theirs, _) = (run(scenario, native=native, steps=120) for native in (None, False))
+    steps = 250 if scenario == "loop" else 120
+    (ours, simulator), (theirs, _) = (run(scenario, native=native, steps=steps) for native in (None, False))
     assert simulator._sight.core is core
     assert not simulator.notices
     assert ours == theirs

@@ -699,7 +699,7 @@ def test_vehicles_that_come_into_sight_again_are_recorded_without_python(tmp_pat
 
     scenario = load_scenario("loop")
     simulator, box = SumoSimulator(scenario, tmp_path), BlackBox(tmp_path / "box")
-    spec = TrialSpec(0, 1, {}, argument_values(scenario), 240)
+    spec = TrialSpec(0, 1, {}, argument_values(scenario), 400)
     calls, recorded, record_roster = [], {}, FastPath._record_roster
     monkeypatch.setattr(FastPath, "_record_roster", lambda path: (calls.append(1), record_roster(path))[1])
     for kind in (Episode, FastEpisode):
@@ -715,7 +715,7 @@ def test_vehicles_that_come_into_sight_again_are_recorded_without_python(tmp_pat
     while at < len(data):
         rosters += data[at] == Tag.ROSTER
         at += 8 + (int.from_bytes(data[at + 4 : at + 8], "little") + 7) // 8 * 8
-    assert rosters > 20
+    assert rosters > 30
     assert len(calls) < rosters  # those of vehicles seen for the first time, and those after an event
     box.close()
     simulator.close()

@@ -8,7 +8,6 @@ from pathlib import Path
 import libsumo
 import numpy as np
 import pytest
-from conftest import examples
 from onlookers import Steady, Watch
 
 from crashhunt.disturbances import disturber_of
@@ -179,7 +178,7 @@ def test_in_dense_traffic_everybody_stays_within_its_type(tmp_path, name):
     assert set(simulator.disturbing_kinds) == set(scenario.backend.disturbances)
     count = 0
     disturber = disturber_of(RATES, agents=tuple(scenario.agents), step_length_s=0.1)
-    for seed in range(examples(5)):
+    for seed in range(3):
         watch, limits = Watch(), {}
         drawn = disturber.draw(seed, 300)
         spec = TrialSpec(0, seed, {}, argument_values(scenario), 300, disturbances=drawn)
@@ -203,7 +202,7 @@ def test_in_dense_traffic_everybody_stays_within_its_type(tmp_path, name):
                     hardest, fastest = limits[actor.id]
                     assert -hardest - 1e-6 <= change <= fastest + 1e-6, (actor.id, after.time_s)
     simulator.close()
-    assert count > 1
+    assert count > 4
 
 
 def test_an_actor_ignores_the_red_light(drive):

@@ -143,7 +143,7 @@ def test_a_collision_with_an_actor_that_has_priority_violates_right_of_way(tmp_p
     table = (minor / "scenario.toml").read_text()
     (minor / "scenario.toml").write_text(table.replace('route = "west-east"', 'route = "north-south"'))
     hit = 0
-    for seed in range(3, 40):  # the first ones hit nobody who has priority
+    for seed in range(3, 40):  # with the seeds 1 and 2, the agent hits no actor that has priority
         result, signals, _, _ = driven(str(minor), seed, 300, tmp_path, agent=Rushes)
         if result.outcome == Outcome.COLLISION and signals["priority_m"].min() == 0:
             hit += 1
